@@ -1,0 +1,115 @@
+"""Files that are either whole or refused: atomic writes and a SHA-256 manifest beside the data."""
+
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+
+MANIFEST_SUFFIX = ".manifest.json"
+
+
+class IntegrityError(ValueError):
+    """A file is not what its manifest says; the message names the file and the broken rule."""
+
+
+def manifest_path(path: str | Path) -> Path:
+    """Where the manifest of a data file lies: the same folder, the same name plus a suffix."""
+    path = Path(path)
+    return path.with_name(path.name + MANIFEST_SUFFIX)
+
+
+def atomic_write(path: str | Path, data: bytes) -> None:
+    """Write bytes so that a reader sees the old file or the new one, never a part.
+
+    The temporary file lies in the same folder: a move across file systems would be a copy, which can be cut short.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def write_verified(path: str | Path, data: bytes, kind: str) -> None:
+    """Write a data file and its manifest; a crash at any moment leaves a pair that loads.
+
+    Two files cannot be replaced at once. The new manifest goes first and also accepts the digest of the file that is
+    still in place, so between the two moves the old data is valid, and after the second the new.
+    """
+    path = Path(path)
+    previous = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+    digest = hashlib.sha256(data).hexdigest()
+    atomic_write(manifest_path(path), _manifest(kind, digest, previous))
+    atomic_write(path, data)
+
+
+def read_verified(path: str | Path, kind: str) -> bytes:
+    """Bytes of a file written by `write_verified`, checked before anything interprets them.
+
+    Raises:
+        FileNotFoundError: no such file.
+        IntegrityError: manifest absent, altered or of another kind; data truncated or altered.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    accepted = _read_manifest(path, kind)
+    data = path.read_bytes()
+    digest = hashlib.sha256(data).hexdigest()
+    if digest not in accepted:
+        raise IntegrityError(
+            f"{path}: SHA-256 of its {len(data)} bytes is {digest[:12]}..., the manifest says {accepted[0][:12]}...; "
+            "the file is truncated or altered"
+        )
+    return data
+
+
+def remove_verified(path: str | Path) -> None:
+    """Delete a data file and its manifest; absent files are no error."""
+    Path(path).unlink(missing_ok=True)
+    manifest_path(path).unlink(missing_ok=True)
+
+
+def _manifest(kind: str, digest: str, previous: str | None) -> bytes:
+    entries = {"kind": kind, "previous_sha256": previous, "sha256": digest, "version": 1}
+    check = hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
+    return (json.dumps({**entries, "check": check}, sort_keys=True, indent=1) + "\n").encode()
+
+
+def _read_manifest(path: Path, kind: str) -> list[str]:
+    """Digests that the manifest accepts, the current one first."""
+    where = manifest_path(path)
+    if not where.is_file():
+        raise IntegrityError(f"{path}: its manifest {where.name} is missing, so the file cannot be trusted")
+    raw = where.read_bytes()
+    try:
+        entries = json.loads(raw)
+        expected = _manifest(entries["kind"], entries["sha256"], entries["previous_sha256"])
+    except (ValueError, KeyError, TypeError):
+        raise IntegrityError(f"{where}: not a manifest of this library") from None
+    if raw != expected:
+        raise IntegrityError(f"{where}: the manifest was altered, its own check does not fit")
+    if entries["kind"] != kind:
+        raise IntegrityError(f"{path}: holds a {entries['kind']!r}, expected a {kind!r}")
+    return [d for d in (entries["sha256"], entries["previous_sha256"]) if d is not None]
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the rename itself durable where the system allows it."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:  # not possible on every system; the file is still whole
+        return
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
