@@ -154,6 +154,11 @@ class GPTransition(nn.Module):
             floor = _pool_factor(floor, weights, diagonal)
         return self._timed(x, dt, _combine(mean, average, floor, diagonal))
 
+    def model_variance(self, x: Tensor, u: Tensor | None = None) -> Tensor:
+        """Variance (..., d) that the GP itself gives to a step from x, the floor left out."""
+        variance = self.gp.variance(x, self._context(u))
+        return variance + self.gp.noise if self.noise == "predictive" else variance
+
     def novelty(self, x: Tensor, u: Tensor | None = None) -> Novelty:
         """Distance of queries x (..., d) from the training data, see `Novelty`."""
         context = self._context(u)
