@@ -1,6 +1,7 @@
 """Gaussian-process dynamics: learned by GPyTorch, frozen into plain torch, used as a law like any other.
 
-`FrozenGP` and `GPTransition` need torch only; `GPRegression`, `SparseGPRegression` and the kernel load GPyTorch when first named.
+`FrozenGP` and `GPTransition` need torch only; `GPRegression`, `SparseGPRegression` and the kernel load GPyTorch when
+first named.
 """
 
 from importlib import import_module
@@ -18,7 +19,7 @@ _HOMES = {
     "SparseGPRegression": "sparse",
 }
 
-__all__ = sorted(_HOMES)  # noqa: PLE0605
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -3,9 +3,9 @@
 Each query is its own test point: rows never share noise and memory grows with the queries, not with their square.
 Two forms, one interface:
 
-* *structured* (affine in the state, periodic in a phase). On the unit circle the squared exponential has the Fourier series
-  exp(-|f - f'|^2 / 2 l^2) = sum_n c_n cos n(u - u') with c_n from Bessel functions that fall faster than any power, so the
-  process *is* a Bayesian linear regression on (harmonics of u) x (1, x), exact to the last bit kept. Its posterior is
+* *structured* (affine in the state, periodic in a phase). On the unit circle the squared exponential is a Fourier
+  series, exp(-|f - f'|^2 / 2 l^2) = sum_n c_n cos n(u - u'), with c_n from Bessel functions that fall faster than any
+  power: the process *is* a Bayesian linear regression on (harmonics of u) x (1, x), exact to rounding. Its posterior is
   held as weights and a factor of their covariance; no difference of large numbers is left, so variances 1e-12 of the
   prior keep their digits, float32 included, and the cost of a query does not depend on the number of training pairs.
 * *dense* (squared exponential with one or D length-scales, exact or with inducing points): cached Cholesky factor and
@@ -204,7 +204,8 @@ class _Dense(nn.Module):
         variance = prior - white.square().sum(-2)
         if self.spread is not None:
             variance = variance + (self.spread.mT @ white).square().sum(-2)
-        # The difference is known to a rounding of the prior and no better: report that much rather than less, or nothing.
+        # The difference is known to a rounding of the prior and no better: report that much rather than less, or
+        # nothing.
         variance = torch.maximum(variance, torch.finfo(variance.dtype).eps * prior)
         lead = features.shape[:-1]
         scaled = variance.mT * self.output_scale.square()
@@ -243,7 +244,12 @@ class FrozenGP(nn.Module):
     noise: Tensor
 
     def __init__(
-        self, kind: Kind, tensors: dict[str, Tensor], noise: Tensor, state_size: int, settings: dict[str, Any] | None = None
+        self,
+        kind: Kind,
+        tensors: dict[str, Tensor],
+        noise: Tensor,
+        state_size: int,
+        settings: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         if kind not in ("structured", "dense"):
@@ -281,13 +287,14 @@ class FrozenGP(nn.Module):
 
         Args:
             features: (..., D); or the state (..., d) with the context apart.
-            context: (..., c) whose leading dims broadcast; few distinct phases (size-1 or absent dims) take the O(1) path.
+            context: (..., c) whose leading dims broadcast; few distinct phases (size-1 or absent dims) take the O(1)
+                path.
 
         Returns:
             mean (..., p) and variance (..., p), in output units and units squared.
         """
         x, context = self._split(features, context)
-        return self.posterior(x, context)  # type: ignore[no-any-return]
+        return self.posterior(x, context)
 
     def mean(self, features: Tensor, context: Tensor | None = None) -> Tensor:
         """Mean alone (..., p): no triangular solve."""
@@ -296,7 +303,7 @@ class FrozenGP(nn.Module):
 
     def variance(self, features: Tensor, context: Tensor | None = None) -> Tensor:
         """Latent variance alone (..., p)."""
-        return self(features, context)[1]  # type: ignore[no-any-return]
+        return self(features, context)[1]
 
     def prior_variance(self, features: Tensor) -> Tensor:
         """Variance before any data, (..., p), at states (..., d) or features (..., D)."""
@@ -314,7 +321,9 @@ class FrozenGP(nn.Module):
         return self.posterior.collapse(phase, variance)
 
     def distance(self, x: Tensor) -> Tensor:
-        """Largest standardised distance of a state coordinate from the training mean, (...): about 1-2 inside the data."""
+        """Largest standardised distance of a state coordinate from the training mean, (...): about 1-2 inside the
+        data.
+        """
         d = self.state_size
         z = (x - self.posterior.input_mean[:d]) / self.posterior.input_scale[:d]
         return z.abs().amax(-1)
@@ -370,7 +379,9 @@ def freeze_structured(
     """
     off = (torch.linalg.vector_norm(phase, dim=-1) - 1).abs().max().item() if len(phase) else 0.0
     if off > 1e-6:
-        raise ValueError(f"the context of a structured GP is (cos u, sin u) on the unit circle, largest miss is {off:.3g}")
+        raise ValueError(
+            f"the context of a structured GP is (cos u, sin u) on the unit circle, largest miss is {off:.3g}"
+        )
     roots = series_roots(lengthscale).to(z)
     f = harmonics(phase, (roots.shape[1] - 1) // 2)
     h = pad(z, (1, 0), value=1.0)

@@ -11,14 +11,12 @@ from torchfilt.gp.frozen import FrozenGP
 from torchfilt.gp.regression import GPRegression, _detached, se_parameters
 
 
-class _VariationalModel(gpytorch.models.ApproximateGP):  # type: ignore[misc]
+class _VariationalModel(gpytorch.models.ApproximateGP):
     """Independent outputs over shared inducing locations, whitened."""
 
     def __init__(self, inducing: Tensor, outputs: int, kernel: gpytorch.kernels.Kernel, jitter: float) -> None:
         distribution = CholeskyVariationalDistribution(len(inducing), batch_shape=torch.Size([outputs]))
-        strategy = VariationalStrategy(
-            self, inducing, distribution, learn_inducing_locations=True, jitter_val=jitter
-        )
+        strategy = VariationalStrategy(self, inducing, distribution, learn_inducing_locations=True, jitter_val=jitter)
         # GPyTorch would draw the start from the global generator at the first call; the prior is a start without noise.
         strategy.variational_params_initialized.fill_(1)
         super().__init__(strategy)
@@ -92,7 +90,9 @@ class SparseGPRegression(GPRegression):
         identity = torch.eye(len(z), dtype=z.dtype, device=z.device)
         factor, info = torch.linalg.cholesky_ex(self.kernel(z).to_dense() + self.jitter * identity)
         if info.any():
-            raise ValueError(f"inducing covariance is not positive definite in {z.dtype}; raise jitter ({self.jitter:g})")
+            raise ValueError(
+                f"inducing covariance is not positive definite in {z.dtype}; raise jitter ({self.jitter:g})"
+            )
         values = strategy.variational_distribution
         alpha = torch.linalg.solve_triangular(factor.mT, values.mean.unsqueeze(-1), upper=True).squeeze(-1)
         tensors = {"inputs": z, "factor": factor, "alpha": alpha, "spread": values.scale_tril}

@@ -25,8 +25,8 @@ class Freezable(Protocol):
 class Novelty(NamedTuple):
     """How far a query is from what was learned.
 
-    variance_ratio (...): largest latent variance over prior variance among the outputs, 0 (known) to 1 (nothing learned).
-    distance (...): largest standardised distance of a state coordinate from the training mean, about 1-2 inside the data.
+    variance_ratio (...): largest latent variance over prior variance among the outputs, 0 (known) to 1 (unknown).
+    distance (...): largest standardised distance of a state coordinate from the training mean, 1 to 2 inside the data.
     """
 
     variance_ratio: Tensor
@@ -38,7 +38,7 @@ def one_step_targets(
 ) -> Tensor:
     """What the GP learns from pairs (x, x_next), both (S, d); returns (S, d).
 
-    target: "residual" x_next - nominal mean; "identity" x_next - x; "next_state" x_next itself (the model-free literature).
+    target: "residual" x_next - nominal mean; "identity" x_next - x; "next_state" x_next itself ("model-free").
 
     Raises:
         ValueError: a residual without a nominal law, or another target with one.
@@ -69,12 +69,13 @@ class GPTransition(nn.Module):
         gp: frozen posterior, or a regression to freeze.
         nominal: law(x, u, dt) -> Gaussian on Euclidean axes whose residual was learned, or None.
         context: function of the control u giving the GP's inputs beyond the state (..., c), such as the phase; or None.
-        target: as in `one_step_targets`; default what the file says, else "residual" with a nominal law, "identity" without.
+        target: as in `one_step_targets`; default what the file says, else "residual" with a nominal law, "identity"
+            without.
         process_noise_scale_tril: (d, d) factor that replaces the nominal law's own noise (the floor), or None.
-        noise: "predictive" adds the learned noise variance (what the kernel cannot explain is an error of the next step too);
-            "latent" leaves it out.
-        dt: time step of the training pairs, s; default what the file says. A step of another length is refused (a float:
-            ValueError; a tensor: NaN rows), zero means no motion.
+        noise: "predictive" adds the learned noise variance (what the kernel cannot explain is an error of the next
+            step too); "latent" leaves it out.
+        dt: time step of the training pairs, s; default what the file says. A step of another length is refused
+            (a float: ValueError; a tensor: NaN rows), zero means no motion.
         space: Euclidean.
 
     Raises:
@@ -103,11 +104,14 @@ class GPTransition(nn.Module):
             need = "needs" if context is None else "does not take"
             raise ValueError(f"this GP {need} a context ({frozen.context_size} inputs beyond the state)")
         if frozen.output_size != frozen.state_size:
-            raise ValueError(f"the GP maps {frozen.state_size} state numbers to {frozen.output_size} outputs, not the same")
+            raise ValueError(
+                f"the GP maps {frozen.state_size} state numbers to {frozen.output_size} outputs, not the same"
+            )
         if type(space) is not type(EUCLIDEAN):
             raise ValueError(f"a GP transition lives on Euclidean axes, got {space!r}")
         self.gp, self.nominal, self.context, self.noise, self.space = frozen, nominal, context, noise, space
         self.dt = frozen.settings.get("dt") if dt is None else dt
+        self.process_noise_scale_tril: Tensor | None
         self.register_buffer("process_noise_scale_tril", process_noise_scale_tril)
 
     def _context(self, u: Tensor | None) -> Tensor | None:
@@ -144,8 +148,8 @@ class GPTransition(nn.Module):
             x: (..., s, d) sigma points. weights: (s,), summing to one. u, dt: with a size-1 or absent sigma-point dim.
 
         Returns:
-            Gaussian with mean (..., s, d) and factor (..., 1, d, d): one small Cholesky a set. Diagonal (..., 1, d) where
-            the floor is diagonal or absent.
+            Gaussian with mean (..., s, d) and factor (..., 1, d, d): one small Cholesky a set. Diagonal (..., 1, d)
+            where the floor is diagonal or absent.
         """
         mean, variance, floor, diagonal = self._parts(x, u, dt)
         # Quadratures with a negative centre weight can push the mean of a flat variance below zero by rounding only.

@@ -42,7 +42,9 @@ def load_checkpoint(path: str | Path, map_location: Any = None) -> dict[str, Any
         loaded = torch.load(io.BytesIO(data), map_location=map_location or "cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
         reason = str(error).split(". ")[0][:200]
-        raise IntegrityError(f"{path}: refused, a checkpoint may hold tensors and plain values only ({reason})") from None
+        raise IntegrityError(
+            f"{path}: refused, a checkpoint may hold tensors and plain values only ({reason})"
+        ) from None
     if not isinstance(loaded, dict):
         raise IntegrityError(f"{path}: a checkpoint is a dictionary, this file holds a {type(loaded).__name__}")
     return loaded

@@ -56,7 +56,9 @@ class TransitionData(pl.LightningDataModule):
         if u is not None and (u.dim() != 2 or len(u) != len(x)):
             raise ValueError(f"u must be (S, k) with S = {len(x)}, got {tuple(u.shape)}")
         for name, value in (("x", x), ("u", u), ("x_next", x_next)):
-            bad = [] if value is None else (~torch.isfinite(value)).any(-1).nonzero()
+            if value is None:
+                continue
+            bad = (~torch.isfinite(value)).any(-1).nonzero()
             if len(bad):
                 raise ValueError(f"{name} must be finite, row {int(bad[0])} is not")
         if not 0 <= held_out < 1:

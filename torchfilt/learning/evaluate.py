@@ -14,8 +14,10 @@ Law = Callable[..., Gaussian]
 class OneStepError(NamedTuple):
     """One-step errors of a law on pairs with known next states.
 
-    rms (d,): root mean square of the error a coordinate. z (d,): rms of error / predicted standard deviation; 1 is honest,
-    above 1 overconfident. predicted (d,): root mean predicted variance. z_model (d,): the same as z against the GP's own
+    rms (d,): root mean square of the error a coordinate. z (d,): rms of error / predicted standard deviation; 1 is
+        honest,
+    above 1 overconfident. predicted (d,): root mean predicted variance. z_model (d,): the same as z against the GP's
+    own
     deviation, without the process-noise floor of the nominal law; NaN for laws that are not a GP.
     """
 

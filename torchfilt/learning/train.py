@@ -39,6 +39,7 @@ class TrainingReport:
         seconds: wall time of the fit alone.
         samples: pairs the posterior is conditioned on. hyperparameter_samples: pairs the hyperparameters saw.
         noise: learned noise standard deviation of each output, its own units.
+        inflation: factors on the standard deviations by calibration, or None.
         interrupted: True where ``stop`` ended the fit early.
         checkpoint: path of the last checkpoint, or None without a run folder.
     """
@@ -49,6 +50,7 @@ class TrainingReport:
     samples: int
     hyperparameter_samples: int
     noise: list[float]
+    inflation: list[float] | None
     interrupted: bool
     checkpoint: str | None
 
@@ -82,6 +84,7 @@ def train_transition(
     kernel: KernelName = "structured",
     shared: bool = False,
     standardize: bool = True,
+    calibrate: bool = True,
     noise_floor: float = 1e-5,
     process_noise_scale_tril: Tensor | None = None,
     hyperparameter_samples: int | None = 250,
@@ -102,13 +105,15 @@ def train_transition(
     """Learn one-step dynamics from pairs.
 
     Args:
-        x: (S, d) states. u: (S, k) controls or None. x_next: (S, d) states dt later. The dtype rules; float64 is advised.
+        x: (S, d) states. u: (S, k) controls or None. x_next: (S, d) states dt later. Their dtype rules.
         nominal: law(x, u, dt) -> Gaussian whose residual is learned, or None.
         dt: time step, s.
         context: function of u giving inputs beyond the state (..., c); the structured kernel needs (cos u, sin u).
-        target, process_noise_scale_tril: see `GPTransition`. kernel, shared, standardize, noise_floor: see `GPRegression`.
-        hyperparameter_samples: rows (a random subset) the marginal likelihood is maximised on; the posterior is conditioned on
-            all. None for all.
+        target, process_noise_scale_tril: see `GPTransition`. kernel, shared, standardize, noise_floor: see
+            `GPRegression`.
+        hyperparameter_samples: rows (a random subset) the marginal likelihood is maximised on; the posterior is
+            conditioned on all. None for all.
+        calibrate: inflate the variances of an exact GP until left-out errors are honest, see `GPRegression.calibrate`.
         inducing: number of inducing points for the sparse form (kernel "ard" or "isotropic"), None for the exact GP.
         batch_size: minibatch of the sparse form.
         optimizer: "lbfgs" for the exact GP and "adam" for the sparse one by default; learning_rate is Adam's.
@@ -135,7 +140,9 @@ def train_transition(
         features = _context(context, u)
     if inducing is not None:
         if kernel == "structured":
-            raise ValueError("the sparse form takes kernel 'ard' or 'isotropic'; the structured kernel needs no inducing points")
+            raise ValueError(
+                "the sparse form takes kernel 'ard' or 'isotropic'; the structured kernel needs no inducing points"
+            )
         regression: GPRegression = SparseGPRegression(
             x, targets, features, kernel=kernel, shared=shared, noise_floor=noise_floor, inducing=inducing, seed=seed
         )
@@ -151,17 +158,20 @@ def train_transition(
     folder = None if run_dir is None else Path(run_dir)
     outcome = _fit(module, data, limit, chosen, tolerance, device, folder, resume, progress, tensorboard, stop)
     module.to("cpu")
+    loss = outcome.loss if inducing is not None else float(regression.loss(rows).detach())
+    inflation = regression.calibrate().sqrt().tolist() if calibrate and inducing is None else None
     frozen = regression.freeze({"target": goal, "dt": dt})
     law = GPTransition(
         frozen, nominal, context=context, target=goal, process_noise_scale_tril=process_noise_scale_tril, dt=dt
     )
     report = TrainingReport(
-        loss=float(regression.loss(rows).detach()) if inducing is None else outcome.loss,
+        loss=loss,
         epochs=outcome.epochs,
         seconds=outcome.seconds,
         samples=len(x),
         hyperparameter_samples=len(x) if rows is None else len(rows),
         noise=frozen.noise.sqrt().tolist(),
+        inflation=inflation,
         interrupted=outcome.interrupted,
         checkpoint=None if folder is None else str(folder / CHECKPOINT),
     )
@@ -193,7 +203,9 @@ def _fit(
     stop: Callable[[], bool] | None,
 ) -> _Outcome:
     """Run Lightning; checkpoints after every epoch where there is a folder."""
-    early = EarlyStopping("loss", min_delta=tolerance, patience=2 if optimizer == "lbfgs" else 20, check_on_train_epoch_end=True)
+    early = EarlyStopping(
+        "loss", min_delta=tolerance, patience=2 if optimizer == "lbfgs" else 20, check_on_train_epoch_end=True
+    )
     stopper = _StopWhen(stop or (lambda: False))
     show = sys.stderr.isatty() if progress is None else progress
     callbacks: list[Callback] = [stopper, early]
@@ -258,7 +270,7 @@ def _check_same_run(module: GPModule, path: Path) -> _Outcome | None:
     if different or set(stored) != set(own):
         name = (different or sorted(set(stored) ^ set(own)))[0].removeprefix("regression.")
         raise ValueError(f"{path}: cannot resume, {name} differs from the run that wrote this checkpoint")
-    early = next((v for k, v in checkpoint["callbacks"].items() if k.startswith("EarlyStopping")), {})
+    early: dict[str, Any] = next((v for k, v in checkpoint["callbacks"].items() if k.startswith("EarlyStopping")), {})
     if not early.get("stopped_epoch"):
         return None
     module.load_state_dict(stored)
