@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,10 @@ def load_checkpoint(path: str | Path, map_location: Any = None) -> dict[str, Any
     """
     data = read_verified(_local(path), FILE_KIND)
     try:
-        # Explicit: TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD only rules where the argument is left out.
-        loaded = torch.load(io.BytesIO(data), map_location=map_location or "cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # advice on foreign pickles; the error below says enough
+            # Explicit: TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD only rules where the argument is left out.
+            loaded = torch.load(io.BytesIO(data), map_location=map_location or "cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
         reason = str(error).split(". ")[0][:200]
         raise IntegrityError(
@@ -80,14 +83,17 @@ def _local(path: str | Path) -> Path:
 
 def _plain(value: Any, where: str) -> Any:
     """The same value made of what the restricted loader accepts."""
-    if isinstance(value, torch.Tensor) or value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
+    # Exact types: numpy's float64 is a float too, and the restricted loader refuses it.
+    if value is None or type(value) in (bool, int, float, complex, str, bytes):
         return value
-    if isinstance(value, (torch.dtype, torch.device)):
+    if isinstance(value, (torch.Tensor, torch.dtype, torch.device)):
         return value
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, np.generic):
         return value.item()
+    if isinstance(value, str):  # string enumerations
+        return str.__str__(value)
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value.copy())
     if isinstance(value, dict):

@@ -280,9 +280,11 @@ def _check_same_run(module: GPModule, path: Path) -> _Outcome | None:
 def _loggers(folder: Path | None, tensorboard: bool) -> list[Logger] | bool:
     if folder is None:
         return False
-    result: list[Logger] = [CSVLogger(folder, name="", version="log")]
+    # Lightning's CSV writer empties a folder that it finds: a resumed run logs beside the first part.
+    part = next(n for n in range(1, 10_000) if not (folder / f"log-{n}").exists())
+    result: list[Logger] = [CSVLogger(folder, name="", version=f"log-{part}")]
     if tensorboard:
-        result.append(TensorBoardLogger(folder, name="", version="tensorboard"))
+        result.append(TensorBoardLogger(folder, name="", version=f"tensorboard-{part}"))
     return result
 
 

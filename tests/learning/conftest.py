@@ -1,0 +1,9 @@
+"""Fixtures of this folder."""
+
+import pytest
+from learning_problem import pairs
+
+
+@pytest.fixture
+def data():
+    return pairs()
