@@ -104,6 +104,17 @@ def test_pooled_is_the_weighted_mean_of_the_noises(kernel, kind):
     torch.testing.assert_close(alone.factor(), factor[0, 0])
 
 
+@pytest.mark.parametrize("kernel", ["structured", "ard"])
+def test_pooling_at_the_centre(kernel):
+    law = build(Nominal("diagonal"), kernel, pooling="centre")
+    x = torch.randn(5, 9, D, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 50
+    u = torch.zeros(1, 1, 1, dtype=torch.float64)
+    weights = torch.full((9,), 1 / 9, dtype=torch.float64)
+    pooled = law.pooled(x, weights, u, DT)
+    torch.testing.assert_close(pooled.mean, law(x, u, DT).mean)
+    torch.testing.assert_close(pooled.variance.squeeze(-2), law(x.mean(-2), u[0], DT).variance)
+
+
 def test_negative_centre_weight_keeps_a_valid_noise():
     law = build(Nominal())
     weights = torch.full((9,), 0.5, dtype=torch.float64)
@@ -175,6 +186,7 @@ def test_law_works_under_transforms_and_compile():
         ({"target": "guess"}, "target must be"),
         ({"context": None}, "needs a context"),
         ({"noise": "none"}, "noise must be"),
+        ({"pooling": "none"}, "pooling must be"),
     ],
 )
 def test_refusals(arguments, message):

@@ -74,6 +74,8 @@ class GPTransition(nn.Module):
         process_noise_scale_tril: (d, d) factor that replaces the nominal law's own noise (the floor), or None.
         noise: "predictive" adds the learned noise variance (what the kernel cannot explain is an error of the next
             step too); "latent" leaves it out.
+        pooling: how `pooled` forms the one variance of a sigma-point set: the weighted "average" over the points, or the
+            variance at their "centre", which saves a dense GP most of its work and differs by the variance's curvature.
         dt: time step of the training pairs, s; default what the file says. A step of another length is refused
             (a float: ValueError; a tensor: NaN rows), zero means no motion.
         space: Euclidean.
@@ -91,6 +93,7 @@ class GPTransition(nn.Module):
         target: Target | None = None,
         process_noise_scale_tril: Tensor | None = None,
         noise: Literal["predictive", "latent"] = "predictive",
+        pooling: Literal["average", "centre"] = "average",
         dt: float | None = None,
         space: Space = EUCLIDEAN,
     ) -> None:
@@ -100,6 +103,8 @@ class GPTransition(nn.Module):
         check_target(self.target, nominal)
         if noise not in ("predictive", "latent"):
             raise ValueError(f"noise must be 'predictive' or 'latent', got {noise!r}")
+        if pooling not in ("average", "centre"):
+            raise ValueError(f"pooling must be 'average' or 'centre', got {pooling!r}")
         if (context is None) != (frozen.context_size == 0):
             need = "needs" if context is None else "does not take"
             raise ValueError(f"this GP {need} a context ({frozen.context_size} inputs beyond the state)")
@@ -110,6 +115,7 @@ class GPTransition(nn.Module):
         if type(space) is not type(EUCLIDEAN):
             raise ValueError(f"a GP transition lives on Euclidean axes, got {space!r}")
         self.gp, self.nominal, self.context, self.noise, self.space = frozen, nominal, context, noise, space
+        self.pooling = pooling
         self.dt = frozen.settings.get("dt") if dt is None else dt
         self.process_noise_scale_tril: Tensor | None
         self.register_buffer("process_noise_scale_tril", process_noise_scale_tril)
@@ -121,11 +127,8 @@ class GPTransition(nn.Module):
             raise ValueError("this transition reads its GP context (the phase) from the control u, and no u was given")
         return self.context(u)
 
-    def _parts(self, x: Tensor, u: Tensor | None, dt: Step) -> tuple[Tensor, Tensor, Tensor | None, bool]:
-        """Mean (..., d), GP variance (..., d), floor factor and whether that is diagonal."""
-        correction, variance = self.gp(x, self._context(u))
-        if self.noise == "predictive":
-            variance = variance + self.gp.noise
+    def _parts(self, x: Tensor, u: Tensor | None, dt: Step, correction: Tensor) -> tuple[Tensor, Tensor | None, bool]:
+        """Mean (..., d), floor factor and whether that is diagonal."""
         floor, diagonal = self.process_noise_scale_tril, False
         if self.nominal is None:
             mean = correction + x if self.target == "identity" else correction
@@ -134,12 +137,17 @@ class GPTransition(nn.Module):
             mean = base.mean + correction
             if floor is None:
                 floor, diagonal = base.scale_tril, base.is_diagonal
-        return mean, variance, floor, diagonal
+        return mean, floor, diagonal
+
+    def _noisy(self, variance: Tensor) -> Tensor:
+        """Latent variance, with the learned noise where that was asked for."""
+        return variance + self.gp.noise if self.noise == "predictive" else variance
 
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Step = None) -> Gaussian:
         """Law of the next state given x (..., d); each row is its own test point."""
-        mean, variance, floor, diagonal = self._parts(x, u, dt)
-        return self._timed(x, dt, _combine(mean, variance, floor, diagonal))
+        correction, variance = self.gp(x, self._context(u))
+        mean, floor, diagonal = self._parts(x, u, dt, correction)
+        return self._timed(x, dt, _combine(mean, self._noisy(variance), floor, diagonal))
 
     def pooled(self, x: Tensor, weights: Tensor, u: Tensor | None = None, dt: Step = None) -> Gaussian:
         """Means at sigma points and one noise for the whole set: the weighted mean of the conditional covariances.
@@ -151,17 +159,22 @@ class GPTransition(nn.Module):
             Gaussian with mean (..., s, d) and factor (..., 1, d, d): one small Cholesky a set. Diagonal (..., 1, d)
             where the floor is diagonal or absent.
         """
-        mean, variance, floor, diagonal = self._parts(x, u, dt)
-        # Quadratures with a negative centre weight can push the mean of a flat variance below zero by rounding only.
-        average = weighted_sum(variance, weights).clamp_min(0).unsqueeze(-2)
+        context = self._context(u)
+        if self.pooling == "centre":
+            correction = self.gp.mean(x, context)
+            average = self._noisy(self.gp.variance(weighted_sum(x, weights).unsqueeze(-2), context))
+        else:
+            correction, variance = self.gp(x, context)
+            # The variance is convex, so a negative centre weight takes its mean below zero by rounding only.
+            average = weighted_sum(self._noisy(variance), weights).clamp_min(0).unsqueeze(-2)
+        mean, floor, diagonal = self._parts(x, u, dt, correction)
         if floor is not None:
             floor = _pool_factor(floor, weights, diagonal)
         return self._timed(x, dt, _combine(mean, average, floor, diagonal))
 
     def model_variance(self, x: Tensor, u: Tensor | None = None) -> Tensor:
         """Variance (..., d) that the GP itself gives to a step from x, the floor left out."""
-        variance = self.gp.variance(x, self._context(u))
-        return variance + self.gp.noise if self.noise == "predictive" else variance
+        return self._noisy(self.gp.variance(x, self._context(u)))
 
     def novelty(self, x: Tensor, u: Tensor | None = None) -> Novelty:
         """Distance of queries x (..., d) from the training data, see `Novelty`."""
