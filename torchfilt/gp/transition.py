@@ -74,8 +74,8 @@ class GPTransition(nn.Module):
         process_noise_scale_tril: (d, d) factor that replaces the nominal law's own noise (the floor), or None.
         noise: "predictive" adds the learned noise variance (what the kernel cannot explain is an error of the next
             step too); "latent" leaves it out.
-        pooling: how `pooled` forms the one variance of a sigma-point set: the weighted "average" over the points, or the
-            variance at their "centre", which saves a dense GP most of its work and differs by the variance's curvature.
+        pooling: how `pooled` forms the one variance of a sigma-point set: the weighted "average" over the points, or
+            the variance at their "centre", which saves a dense GP most of its work and differs by the variance's curvature.
         dt: time step of the training pairs, s; default what the file says. A step of another length is refused
             (a float: ValueError; a tensor: NaN rows), zero means no motion.
         space: Euclidean.
@@ -125,7 +125,8 @@ class GPTransition(nn.Module):
             return None
         if u is None:
             raise ValueError("this transition reads its GP context (the phase) from the control u, and no u was given")
-        return self.context(u)
+        # Controls may stay in double precision where the state is in single.
+        return self.context(u).to(self.gp.noise.dtype)
 
     def _parts(self, x: Tensor, u: Tensor | None, dt: Step, correction: Tensor) -> tuple[Tensor, Tensor | None, bool]:
         """Mean (..., d), floor factor and whether that is diagonal."""

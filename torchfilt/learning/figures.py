@@ -19,7 +19,9 @@ def plot_one_step(error: Array, deviation: Array, angle: Array | None, label: st
     """
     x = np.arange(len(error)) if angle is None else np.degrees(np.mod(angle, 2 * np.pi))
     order = np.argsort(x)
-    ax.fill_between(x[order], -2 * deviation[order], 2 * deviation[order], color="0.85", lw=0, label="predicted 2 sigma")
+    ax.fill_between(
+        x[order], -2 * deviation[order], 2 * deviation[order], color="0.85", lw=0, label="predicted 2 sigma"
+    )
     ax.plot(x[order], error[order], ".", ms=3, label="error")
     ax.set_xlabel("sample" if angle is None else "argument of latitude, deg")
     ax.set_ylabel(label)

@@ -138,6 +138,7 @@ def train_transition(
     with torch.no_grad():
         targets = one_step_targets(x, u, x_next, dt, target=goal, nominal=nominal)
         features = _context(context, u)
+        features = None if features is None else features.to(x)
     if inducing is not None:
         if kernel == "structured":
             raise ValueError(

@@ -86,6 +86,12 @@ class ClohessyWiltshire(nn.Module):
         ValueError: n not positive, psd negative, dt_s negative.
     """
 
+    mean_motion_rad_s: Tensor
+    acceleration_psd_m2_s3: Tensor
+    matrix: Tensor
+    push: Tensor
+    scale_tril: Tensor
+
     def __init__(
         self,
         mean_motion_rad_s: Tensor | float,

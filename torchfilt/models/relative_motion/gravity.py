@@ -8,7 +8,8 @@ from torch import Tensor
 # WGS-84's own value is 3.986004418e14; the formation study this package follows rounds it.
 MU_M3_S2 = 3.986004e14
 EARTH_RADIUS_M = 6378136.3
-J2_EARTH = 1.0826261738522e-3
+# EGM2008: J_n = -sqrt(2 n + 1) C_n0, with the radius above.
+J2_EARTH = 1.0826261738522227e-3
 
 
 class Field(NamedTuple):

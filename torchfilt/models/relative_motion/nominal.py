@@ -47,6 +47,8 @@ class TwoBody(nn.Module):
         ValueError: negative psd, mu or step count that make no sense.
     """
 
+    acceleration_psd_m2_s3: Tensor
+
     def __init__(
         self,
         acceleration_psd_m2_s3: Tensor | float,
@@ -84,6 +86,8 @@ class LinearTimeVarying(nn.Module):
     Arguments as in `TwoBody`. Good while the separation is a small part of the orbit's radius: the neglected term is
     of order 3 n^2 s^2 / r (4e-8 m/s^2 at 500 m).
     """
+
+    acceleration_psd_m2_s3: Tensor
 
     def __init__(
         self,

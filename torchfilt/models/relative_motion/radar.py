@@ -59,6 +59,9 @@ class RendezvousRadar(nn.Module):
         resolved by atan2.
     """
 
+    chief_radius_m: Tensor
+    standard_deviation: Tensor
+
     def __init__(
         self,
         chief_radius_m: Tensor | float,

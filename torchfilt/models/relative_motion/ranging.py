@@ -1,6 +1,7 @@
 """Ranging between two satellites far apart: a range with a constant bias, and two angles."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +27,8 @@ class WithConstant(nn.Module):
         ValueError: size below 1, negative drift.
     """
 
+    drift_psd: Tensor
+
     def __init__(
         self, law: nn.Module | Callable[..., Gaussian], size: int = 1, drift_psd: Tensor | float = 0.0
     ) -> None:
@@ -35,7 +38,8 @@ class WithConstant(nn.Module):
         drift = drift_psd if isinstance(drift_psd, Tensor) else torch.tensor(drift_psd, dtype=torch.float64)
         if not bool((drift.detach() >= 0).all()):
             raise ValueError(f"drift_psd must be >= 0, got {drift_psd}")
-        self.law, self.size = law, size
+        self.law: Any = law
+        self.size = size
         hold(self, "drift_psd", drift)
         # Filters ask with hasattr which short cuts a law has, so they exist only where the inner law has them.
         if hasattr(law, "linear_form"):
@@ -45,11 +49,11 @@ class WithConstant(nn.Module):
 
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Step = None) -> Gaussian:
         """Law of the longer state (..., d + size)."""
-        inner = self.law(x[..., : -self.size], u, dt)
+        inner: Gaussian = self.law(x[..., : -self.size], u, dt)
         return self._extend(inner, x[..., -self.size :], dt)
 
     def _pooled(self, x: Tensor, weights: Tensor, u: Tensor | None = None, dt: Step = None) -> Gaussian:
-        inner = self.law.pooled(x[..., : -self.size], weights, u, dt)
+        inner: Gaussian = self.law.pooled(x[..., : -self.size], weights, u, dt)
         return self._extend(inner, x[..., -self.size :], dt)
 
     def _linear_form(self, u: Tensor | None = None, dt: Step = None) -> LinearForm:
@@ -76,9 +80,9 @@ class WithConstant(nn.Module):
             if bool(self.drift_psd.detach().any()):
                 raise ValueError("a drifting constant needs the time step dt")
             dt = 0.0
-        deviation = (psd * dt).sqrt()
+        variance: Tensor = psd * dt
         lead = dt.shape[:-1] if isinstance(dt, Tensor) else ()
-        return torch.diag_embed(deviation.expand(*lead, self.size).to(like.dtype))
+        return torch.diag_embed(variance.sqrt().expand(*lead, self.size).to(like.dtype))
 
 
 def _block(first: Tensor, second: Tensor) -> Tensor:

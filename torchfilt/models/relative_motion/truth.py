@@ -27,7 +27,7 @@ class FormationSettings:
 
     Angles in rad. ``relative_start`` is the deputy's Hill state in m and m/s; None makes the study's closed ellipse:
     x = 300 m, z = -400 m, vx = -0.2 m/s, vz = 0.1 m/s, y = 2 vx / n, vy = -2 n x. The study leaves the drag open:
-    C_D = 2.2, 1 m^2 each, exponential atmosphere co-rotating with the Earth.
+    C_D = 2.2, 1 m^2 each, exponential atmosphere co-rotating with the Earth. Zonal coefficients are those of EGM2008.
     """
 
     semi_major_axis_m: float = 7.0e6
@@ -40,8 +40,8 @@ class FormationSettings:
     mu_m3_s2: float = MU_M3_S2
     earth_radius_m: float = EARTH_RADIUS_M
     j2: float = J2_EARTH
-    j3: float = -2.5326564853e-6
-    j4: float = -1.6196215914e-6
+    j3: float = -2.532410518567722e-6
+    j4: float = -1.619897599916973e-6
     earth_rate_rad_s: float = 7.292115146706979e-5
     chief_mass_kg: float = 200.0
     deputy_mass_kg: float = 100.0

@@ -1,0 +1,209 @@
+"""Conditional laws: what a state-space model is made of.
+
+A law is an `nn.Module`. A transition is called as ``law(x, u, dt)``, a measurement law as ``law(x)``; both return a
+`Gaussian` (or any `torch.distributions.Distribution`) with the same leading dims as x. Controls and time steps arrive
+broadcastable: u is (*lead, k) and dt is a number or (*lead, 1) where lead broadcasts with the leading dims of x.
+"""
+
+import inspect
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor, nn
+
+from torchfilt.gaussian import Gaussian
+from torchfilt.linalg import psd_factor
+from torchfilt.spaces import EUCLIDEAN, Space
+
+
+class LinearForm(NamedTuple):
+    """``y = matrix @ x + offset + scale_tril @ noise``; shapes (..., m, d), (..., m) or None, (..., m, m)."""
+
+    matrix: Tensor
+    offset: Tensor | None
+    scale_tril: Tensor
+
+
+@runtime_checkable
+class HasLinearForm(Protocol):
+    """A law that is linear in the state gives its matrices; exact filters and the shared-covariance path use them."""
+
+    def linear_form(self, u: Tensor | None = None, dt: Tensor | float | None = None) -> LinearForm:
+        """Matrices for this control and time step."""
+        ...
+
+
+class _Factor(nn.Module):
+    """Holds the factor of a covariance that was given as a number, a vector of variances' matrix or a factor.
+
+    A tensor that already requires grad keeps its graph and is factorised at each call, so that
+    gradients reach the caller's own covariance.
+    """
+
+    def __init__(self, covariance: Tensor | None, scale_tril: Tensor | None, trainable: bool) -> None:
+        super().__init__()
+        if (covariance is None) == (scale_tril is None):
+            raise ValueError("give exactly one of covariance= and scale_tril=")
+        self._covariance: Tensor | None = None
+        if covariance is not None and covariance.requires_grad:
+            psd_factor(covariance)
+            if isinstance(covariance, nn.Parameter):
+                self.covariance = covariance
+            else:
+                self._covariance = covariance
+            return
+        factor = psd_factor(covariance) if covariance is not None else scale_tril
+        assert factor is not None
+        hold(self, "scale_tril", factor, trainable)
+
+    def forward(self) -> Tensor:
+        if hasattr(self, "scale_tril"):
+            return self.scale_tril.tril() if self.scale_tril.requires_grad else self.scale_tril
+        covariance = self._covariance if self._covariance is not None else self.covariance
+        return psd_factor(covariance)
+
+
+def hold(module: nn.Module, name: str, tensor: Tensor, trainable: bool = False) -> None:
+    """Keep a tensor on a module: a parameter stays one, a tensor with a graph keeps it, anything else is a buffer."""
+    if isinstance(tensor, nn.Parameter):
+        module.register_parameter(name, tensor)
+    elif tensor.requires_grad:
+        setattr(module, name, tensor)
+    elif trainable:
+        module.register_parameter(name, nn.Parameter(tensor.clone()))
+    else:
+        module.register_buffer(name, tensor.clone())
+
+
+class LinearGaussian(nn.Module):
+    """``y ~ N(matrix @ x + offset + control_matrix @ u, covariance)``.
+
+    Args:
+        matrix: (m, d) or (*batch, m, d).
+        covariance: (m, m) positive semidefinite; or give ``scale_tril``, its lower factor.
+        offset: (m,) or None.
+        control_matrix: (m, k) or None.
+        trainable: make matrix, factor and offset `nn.Parameter`s.
+
+    Raises:
+        ValueError: shapes that do not fit, a covariance that is not positive semidefinite.
+    """
+
+    def __init__(
+        self,
+        matrix: Tensor,
+        covariance: Tensor | None = None,
+        offset: Tensor | None = None,
+        *,
+        control_matrix: Tensor | None = None,
+        scale_tril: Tensor | None = None,
+        trainable: bool = False,
+    ) -> None:
+        super().__init__()
+        if matrix.dim() < 2:
+            raise ValueError(f"matrix must be (*batch, m, d), got shape {tuple(matrix.shape)}")
+        check_finite(matrix, "matrix")
+        self.noise = _Factor(covariance, scale_tril, trainable)
+        m = matrix.shape[-2]
+        noise_size = self.noise().shape[-1]
+        if noise_size != m:
+            raise ValueError(f"covariance must be {m} x {m} to fit matrix {tuple(matrix.shape)}, got {noise_size}")
+        if offset is not None and offset.shape[-1:] != (m,):
+            raise ValueError(f"offset must end in {m} to fit matrix {tuple(matrix.shape)}, got {tuple(offset.shape)}")
+        if control_matrix is not None and control_matrix.shape[-2] != m:
+            raise ValueError(f"control_matrix must have {m} rows, got shape {tuple(control_matrix.shape)}")
+        hold(self, "matrix", matrix, trainable)
+        self.offset: Tensor | None
+        self.control_matrix: Tensor | None
+        for name, tensor in (("offset", offset), ("control_matrix", control_matrix)):
+            if tensor is None:
+                setattr(self, name, None)
+            else:
+                hold(self, name, tensor, trainable)
+
+    def linear_form(self, u: Tensor | None = None, dt: Tensor | float | None = None) -> LinearForm:
+        """The matrices; u (..., k) enters the offset."""
+        offset = self.offset
+        if self.control_matrix is not None:
+            if u is None:
+                raise ValueError("this law has a control_matrix but no control u was given")
+            push = u @ self.control_matrix.mT
+            offset = push if offset is None else offset + push
+        return LinearForm(self.matrix, offset, self.noise())
+
+    def forward(self, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None) -> Gaussian:
+        """Law of y given x (..., d)."""
+        matrix, offset, scale_tril = self.linear_form(u, dt)
+        mean = (matrix @ x.mT).mT if x.dim() > 1 and matrix.dim() == 2 else (matrix @ x.unsqueeze(-1)).squeeze(-1)
+        return Gaussian(mean if offset is None else mean + offset, scale_tril)
+
+
+class AdditiveGaussian(nn.Module):
+    """``y ~ N(function(x, u, dt), covariance)`` with errors on ``space``.
+
+    Args:
+        function: batched over leading dims; takes x and, by name or in this order, u and dt; unused ones may be absent.
+            An `nn.Module` is registered, so its parameters train.
+        covariance: (e, e) positive semidefinite; or give ``scale_tril``.
+        space: where y lives.
+        trainable: make the noise factor an `nn.Parameter`.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Tensor],
+        covariance: Tensor | None = None,
+        space: Space = EUCLIDEAN,
+        *,
+        scale_tril: Tensor | None = None,
+        trainable: bool = False,
+    ) -> None:
+        super().__init__()
+        self.function = function
+        self.call = adapt(function)
+        self.noise = _Factor(covariance, scale_tril, trainable)
+        self.space = space
+        noise_size = self.noise().shape[-1]
+        if space.tangent_size is not None and space.tangent_size != noise_size:
+            raise ValueError(
+                f"covariance must be {space.tangent_size} x {space.tangent_size} on {space!r}, got {noise_size}"
+            )
+
+    def forward(self, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None) -> Gaussian:
+        """Law of y given x (..., d)."""
+        return Gaussian(self.call(x, u, dt), self.noise(), self.space)
+
+
+def adapt(function: Callable[..., object]) -> Callable[..., object]:
+    """Let ``function`` be called as f(x, u, dt) whichever of u and dt it takes, by name or by position."""
+    target = function.forward if isinstance(function, nn.Module) else function
+    try:
+        parameters = list(inspect.signature(target).parameters.values())
+    except (TypeError, ValueError):  # a builtin such as torch.sin: takes the state alone
+        return lambda x, u=None, dt=None: function(x)
+    if any(p.kind is p.VAR_POSITIONAL for p in parameters):
+        return lambda x, u=None, dt=None: function(x, u, dt)
+    names = [p.name for p in parameters[1:]]
+    by_name = {"u", "dt"} & set(names)
+    if by_name:
+        takes_u, takes_dt = "u" in by_name, "dt" in by_name
+        if takes_u and takes_dt:
+            return lambda x, u=None, dt=None: function(x, u=u, dt=dt)
+        if takes_u:
+            return lambda x, u=None, dt=None: function(x, u=u)
+        return lambda x, u=None, dt=None: function(x, dt=dt)
+    required = [p for p in parameters[1:] if p.default is p.empty and p.kind is not p.KEYWORD_ONLY]
+    if len(required) == 0:
+        return lambda x, u=None, dt=None: function(x)
+    if len(required) == 1:
+        return lambda x, u=None, dt=None: function(x, u)
+    return lambda x, u=None, dt=None: function(x, u, dt)
+
+
+def check_finite(tensor: Tensor, name: str) -> None:
+    """Raise a ValueError that names the first entry that is not finite."""
+    bad = ~torch.isfinite(tensor.detach())
+    if bad.any():
+        where = tuple(bad.nonzero()[0].tolist())
+        raise ValueError(f"{name} must be finite, entry {where} is {tensor.detach()[where].item()}")

@@ -1,0 +1,118 @@
+"""Small-matrix algebra on factors: one triangularisation serves every square-root recursion."""
+
+import torch
+from torch import Tensor
+
+
+def triangularize(columns: Tensor) -> Tensor:
+    """Lower-triangular factor of ``columns @ columns.mT`` by one QR, without forming the product.
+
+    Args:
+        columns: (*batch, e, k) with k >= e, any finite numbers.
+
+    Returns:
+        (*batch, e, e), lower triangular, diagonal >= 0.
+    """
+    # mode="r" is half the work but has no derivative; "reduced" has one.
+    mode = "reduced" if torch.is_grad_enabled() and columns.requires_grad else "r"
+    r = torch.linalg.qr(columns.mT, mode=mode).R
+    diagonal = r.diagonal(dim1=-2, dim2=-1)
+    sign = torch.where(diagonal < 0, -torch.ones_like(diagonal), torch.ones_like(diagonal))
+    return (r * sign.unsqueeze(-1)).mT
+
+
+def cholesky_downdate(factor: Tensor, vector: Tensor) -> Tensor:
+    """Lower factor of ``factor @ factor.mT - vector vector^T`` by hyperbolic rotations.
+
+    Args:
+        factor: (*batch, e, e) lower triangular.
+        vector: (*batch, e).
+
+    Returns:
+        (*batch, e, e); NaN in the rows of the batch where the difference is not positive definite.
+
+    Source: Golub and Van Loan, Matrix Computations, section 6.5.
+    """
+    columns = []
+    rest = vector
+    for j in range(factor.shape[-1]):
+        column = factor[..., :, j]
+        pivot = torch.sqrt(column[..., j] ** 2 - rest[..., j] ** 2).unsqueeze(-1)
+        cosine = column[..., j : j + 1] / pivot
+        sine = rest[..., j : j + 1] / pivot
+        columns.append(cosine * column - sine * rest)
+        rest = cosine * rest - sine * column
+    return torch.stack(columns, dim=-1).tril()
+
+
+def psd_factor(covariance: Tensor, name: str = "covariance") -> Tensor:
+    """Lower-triangular factor of a symmetric positive semidefinite matrix, singular ones included.
+
+    Args:
+        covariance: (*batch, e, e).
+        name: how the caller calls the matrix, for the error.
+
+    Raises:
+        ValueError: not square, not finite, not symmetric or with a negative eigenvalue; the value is named.
+    """
+    if covariance.dim() < 2 or covariance.shape[-1] != covariance.shape[-2]:
+        raise ValueError(f"{name} must be a square matrix (*batch, e, e), got shape {tuple(covariance.shape)}")
+    if not covariance.is_floating_point():
+        raise TypeError(f"{name} must be a floating-point tensor, got {covariance.dtype}")
+    values = covariance.detach()
+    if not torch.isfinite(values).all():
+        raise ValueError(f"{name} must be finite, got {values.tolist()}")
+    scale = values.diagonal(dim1=-2, dim2=-1).abs().amax(-1)
+    slack = 64 * torch.finfo(covariance.dtype).eps * covariance.shape[-1]
+    skew = (values - values.mT).abs().amax((-2, -1))
+    if (skew > slack * scale).any():
+        raise ValueError(f"{name} must be symmetric, largest difference from its transpose is {skew.max().item():.3g}")
+    factor, info = torch.linalg.cholesky_ex(covariance)
+    if not info.any():
+        return factor
+    eigenvalues, vectors = torch.linalg.eigh(covariance)
+    lowest = eigenvalues.detach().amin(-1)
+    if (lowest < -slack * scale).any():
+        raise ValueError(f"{name} must be positive semidefinite, its lowest eigenvalue is {lowest.min().item():.3g}")
+    return triangularize(vectors * eigenvalues.clamp_min(0).sqrt().unsqueeze(-2))
+
+
+def apply_factor(factor: Tensor, vectors: Tensor, *, diagonal: bool = False) -> Tensor:
+    """``factor @ v`` for each vector, one matrix product when the factor is shared.
+
+    Args:
+        factor: (e, e), (*batch, 1, e, e) or one per vector (*batch, n, e, e); with ``diagonal``, (..., e).
+        vectors: (*batch, n, e).
+    """
+    if diagonal:
+        return factor * vectors
+    if vectors.dim() == 1:
+        return factor @ vectors if factor.dim() == 2 else (factor @ vectors.unsqueeze(-1)).squeeze(-1)
+    if factor.dim() == 2:
+        return (factor @ vectors.mT).mT  # keeps a particle-last memory layout particle-last
+    if factor.shape[-3] == 1:
+        return (factor.squeeze(-3) @ vectors.mT).mT
+    return (factor @ vectors.unsqueeze(-1)).squeeze(-1)
+
+
+def whiten(factor: Tensor, residual: Tensor, *, diagonal: bool = False) -> Tensor:
+    """``factor^-1 @ r`` for each residual; shapes as in `apply_factor`."""
+    if diagonal:
+        return residual / factor
+    if residual.dim() == 1:
+        return torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
+    if factor.dim() == 2:
+        if residual.dim() == 2:
+            return torch.linalg.solve_triangular(factor, residual.mT, upper=False).mT
+        # Broadcasting a shared factor would copy it for each row; inverting the small triangle once is cheaper.
+        identity = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+        return (torch.linalg.solve_triangular(factor, identity, upper=False) @ residual.mT).mT
+    if factor.shape[-3] == 1:
+        return torch.linalg.solve_triangular(factor.squeeze(-3), residual.mT, upper=False).mT
+    return torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
+
+
+def log_abs_diagonal(factor: Tensor, *, diagonal: bool = False) -> Tensor:
+    """Sum of ``log |diagonal|``: half the log-determinant of the covariance. Shape (...)."""
+    values = factor if diagonal else factor.diagonal(dim1=-2, dim2=-1)
+    return values.abs().log().sum(-1)

@@ -1,0 +1,325 @@
+"""Moment rules: how a Gaussian goes through a law.
+
+Every rule turns (law, Gaussian) into one `Linearization`; one square-root recursion (`predict`, `update`) does the
+rest. A quadrature is data; Taylor is the exact derivative. For laws that are linear in the state all rules agree.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
+from torchfilt.laws import HasLinearForm
+from torchfilt.linalg import apply_factor, cholesky_downdate, log_abs_diagonal, triangularize, whiten
+from torchfilt.spaces import EUCLIDEAN, Space
+
+Law = Callable[..., Gaussian]
+
+
+class Linearization(NamedTuple):
+    """A law seen from a Gaussian N(m, S S^T): ``y = mean + slope e + residual r + noise w``, (e, r, w) standard normal.
+
+    mean (..., d_y); slope (..., e_y, e_x), the response to the whitened error e where x = retract(m, S e);
+    residual (..., e_y, k) what no linear map explains, or None; noise (..., e_y, e_y) the mean conditional covariance's
+    factor; negative (..., e_y): a column to be subtracted, for quadratures with a negative weight.
+    """
+
+    mean: Tensor
+    slope: Tensor
+    residual: Tensor | None
+    noise: Tensor
+    space: Space
+    negative: Tensor | None = None
+
+    def spread(self) -> Tensor:
+        """Columns whose product is the part of the covariance that does not come from the slope."""
+        return self.noise if self.residual is None else cat_columns(self.residual, self.noise)
+
+
+class Rule(Protocol):
+    """A moment rule."""
+
+    def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
+        """See `Linearization`."""
+        ...
+
+
+def lift(value: Tensor | float | None) -> Tensor | float | None:
+    """Make room for the sigma-point axis in a control or time step; unbatched values broadcast as they are."""
+    return value.unsqueeze(-2) if isinstance(value, Tensor) and value.dim() > 1 else value
+
+
+@dataclass(frozen=True)
+class Taylor:
+    """First-order expansion about the mean (the extended Kalman filter's rule), exact derivatives on any space."""
+
+    def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
+        """One evaluation and one forward-mode sweep; none for laws that give their linear form."""
+        if isinstance(law, HasLinearForm):
+            matrix, offset, noise = law.linear_form(u, dt)
+            mean = apply_factor(matrix, belief.mean)
+            return Linearization(
+                mean if offset is None else mean + offset, matrix @ belief.factor(), None, noise, law_space(law)
+            )
+        at_mean = law(belief.mean, u, dt)
+        factor = belief.factor().expand(*belief.mean.shape[:-1], -1, -1)
+        u_points, dt_points = lift(u), lift(dt)
+
+        def response(error: Tensor) -> Tensor:
+            points = belief.space.retract(belief.mean.unsqueeze(-2), error)
+            return at_mean.space.local(at_mean.mean.unsqueeze(-2), law(points, u_points, dt_points).mean)
+
+        # One row per direction, so a single forward-mode sweep over the batch gives the whole Jacobian.
+        directions = factor.mT.contiguous()
+        _, slope = torch.func.jvp(response, (torch.zeros_like(directions),), (directions,))
+        return Linearization(at_mean.mean, slope.mT, None, at_mean.factor(), at_mean.space)
+
+
+class Quadrature(NamedTuple):
+    """Nodes (s, e) for a standard normal with weights (s,) of the mean and of the covariance.
+
+    ``paired``: nodes are [centre, +c I, -c I], so slope and residual split without a matrix product.
+    """
+
+    nodes: Tensor
+    mean_weights: Tensor
+    covariance_weights: Tensor
+    paired: bool
+
+
+@dataclass(frozen=True)
+class SigmaPoints:
+    """Statistical linearisation with a quadrature that is built for each dimension."""
+
+    name: str
+    build: Callable[[int], Quadrature]
+
+    def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
+        """One batched evaluation of the law at all nodes."""
+        rule = _quadrature(self.build, belief.tangent_size, belief.mean.dtype, belief.mean.device)
+        offsets = rule.nodes @ belief.factor().mT
+        points = belief.space.retract(belief.mean.unsqueeze(-2), offsets)
+        at_points, noise = _evaluate(law, points, rule.mean_weights, lift(u), lift(dt))
+        space = at_points.space
+        mean = space.mean(at_points.mean, rule.mean_weights)
+        deviation = space.local(mean.unsqueeze(-2), at_points.mean)
+        split = _split_paired if rule.paired else _split
+        slope, residual, negative = split(rule, deviation)
+        return Linearization(mean, slope, residual, noise, space, negative)
+
+
+def _split_paired(rule: Quadrature, deviation: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Rotate each +- pair of columns into its odd part (the slope, exactly) and its even part (the residual)."""
+    size = rule.nodes.shape[-1]
+    weight, central = rule.covariance_weights[1], float(rule.covariance_weights[0])
+    centre, plus, minus = deviation.split([1, size, size], dim=-2)
+    half = torch.sqrt(weight / 2)
+    slope = (half * (plus - minus)).mT
+    even = half * (plus + minus)
+    if central > 0:
+        even = torch.cat([even, central**0.5 * centre], -2)
+    negative = (-central) ** 0.5 * centre.squeeze(-2) if central < 0 else None
+    return slope, even.mT, negative
+
+
+def _split(rule: Quadrature, deviation: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Project the weighted columns on the weighted nodes; the rest is residual."""
+    root = rule.covariance_weights.sqrt().unsqueeze(-1)
+    columns, nodes = root * deviation, root * rule.nodes
+    slope = columns.mT @ nodes
+    return slope, columns.mT - slope @ nodes.mT, None
+
+
+def _evaluate(
+    law: Law, points: Tensor, weights: Tensor, u: Tensor | None, dt: Tensor | float | None
+) -> tuple[Gaussian, Tensor]:
+    """Conditional means at the points and the factor of the weighted mean of the conditional covariances."""
+    pooled = getattr(law, "pooled", None)
+    if pooled is not None:  # the law averages its own noise, cheaper than one factor a point
+        result = pooled(points, weights, u, dt)
+        factor = result.factor()
+        return result, factor.squeeze(-3) if factor.dim() > 2 else factor
+    result = law(points, u, dt)
+    scale = result.scale_tril
+    if result.is_diagonal:
+        varies = scale.dim() > 1 and scale.shape[-2] > 1
+        if varies:
+            scale = (scale.square() * weights.unsqueeze(-1)).sum(-2).sqrt()
+        elif scale.dim() > 1:
+            scale = scale.squeeze(-2)
+        return result, torch.diag_embed(scale)
+    if scale.dim() == 2:
+        return result, scale
+    if scale.shape[-3] == 1:
+        return result, scale.squeeze(-3)
+    if (weights < 0).any():
+        covariance = (scale @ scale.mT * weights[:, None, None]).sum(-3)
+        factor, failed = torch.linalg.cholesky_ex(covariance)
+        return result, torch.where((failed > 0)[..., None, None], torch.nan, factor)
+    columns = (scale * weights.sqrt()[:, None, None]).movedim(-3, -2)
+    return result, triangularize(columns.flatten(-2))
+
+
+@lru_cache(maxsize=64)
+def _quadrature(build: Callable[[int], Quadrature], size: int, dtype: torch.dtype, device: torch.device) -> Quadrature:
+    rule = build(size)
+    return Quadrature(*(part.to(dtype=dtype, device=device) for part in rule[:3]), rule.paired)  # type: ignore[arg-type]
+
+
+def taylor() -> Taylor:
+    """First-order Taylor rule."""
+    return Taylor()
+
+
+@lru_cache(maxsize=32)
+def unscented(alpha: float = 1.0, beta: float = 0.0, kappa: float | None = None) -> SigmaPoints:
+    """Unscented transform with 2e + 1 points.
+
+    The default (alpha 1, beta 0, kappa max(3 - e, 1)) keeps every weight positive. Small alpha makes the central weight
+    negative; that is done by a Cholesky downdate, which can fail and then says so in the row's status.
+
+    Raises:
+        ValueError: alpha is not positive.
+
+    Source: Julier, The scaled unscented transformation, ACC 2002.
+    """
+    if not alpha > 0:
+        raise ValueError(f"alpha must be positive, got {alpha}")
+
+    def build(size: int) -> Quadrature:
+        shape = max(3.0 - size, 1.0) if kappa is None else kappa
+        reach = alpha**2 * (size + shape)
+        if reach <= 0:
+            raise ValueError(f"size + kappa must be positive, got {size} + {shape}")
+        side = torch.full((2 * size,), 1 / (2 * reach), dtype=torch.float64)
+        central = 1 - size / reach
+        eye = torch.eye(size, dtype=torch.float64) * reach**0.5
+        nodes = torch.cat([torch.zeros(1, size, dtype=torch.float64), eye, -eye])
+        mean_weights = torch.cat([torch.tensor([central], dtype=torch.float64), side])
+        spread = torch.cat([torch.tensor([central + 1 - alpha**2 + beta], dtype=torch.float64), side])
+        return Quadrature(nodes, mean_weights, spread, True)
+
+    return SigmaPoints("unscented", build)
+
+
+@lru_cache(maxsize=1)
+def cubature() -> SigmaPoints:
+    """Third-degree spherical-radial cubature with 2e points. Source: Arasaratnam and Haykin, IEEE TAC 54 (2009)."""
+    base = unscented(kappa=0.0)
+    return SigmaPoints("cubature", base.build)
+
+
+@lru_cache(maxsize=16)
+def gauss_hermite(order: int = 3) -> SigmaPoints:
+    """Product Gauss-Hermite rule with ``order ** e`` points, exact to degree 2 order - 1 in each axis.
+
+    Raises:
+        ValueError: order below 2, or more than 100,000 points.
+
+    Source: Ito and Xiong, IEEE TAC 45 (2000).
+    """
+    if order < 2:
+        raise ValueError(f"order must be at least 2, got {order}")
+
+    def build(size: int) -> Quadrature:
+        if order**size > 100_000:
+            raise ValueError(f"{order} ** {size} points are too many; lower the order or take cubature()")
+        # Eigenvalues of the Jacobi matrix of the probabilists' Hermite polynomials (Golub and Welsch).
+        off = torch.arange(1, order, dtype=torch.float64).sqrt()
+        nodes, vectors = torch.linalg.eigh(torch.diag(off, 1) + torch.diag(off, -1))
+        weights = vectors[0].square()
+        grid = torch.cartesian_prod(*[nodes] * size).reshape(-1, size)
+        product = torch.cartesian_prod(*[weights] * size).reshape(-1, size).prod(-1)
+        return Quadrature(grid, product, product, False)
+
+    return SigmaPoints("gauss_hermite", build)
+
+
+def law_space(law: object) -> Space:
+    """Space of a law that gives a linear form: Euclidean unless it says otherwise."""
+    return getattr(law, "space", EUCLIDEAN)
+
+
+def predict(law: Law, belief: Gaussian, rule: Rule, u: Tensor | None, dt: Tensor | float | None) -> Gaussian:
+    """Belief pushed through a transition law."""
+    line = rule.linearize(law, belief, u, dt)
+    factor = triangularize(cat_columns(line.slope, line.spread()))
+    if line.negative is not None:
+        factor = cholesky_downdate(factor, line.negative)
+    return Gaussian(line.space.project(line.mean), factor, line.space)
+
+
+class Update(NamedTuple):
+    """What a measurement did: posterior, log-likelihood (...), innovation (..., e) and its factor, NIS (...)."""
+
+    belief: Gaussian
+    log_likelihood: Tensor
+    innovation: Tensor
+    innovation_scale_tril: Tensor
+    nis: Tensor
+
+
+def update(
+    law: Law, prior: Gaussian, y: Tensor, rule: Rule, observed: Tensor | None = None, iterations: int = 1
+) -> Update:
+    """Belief given a measurement y (..., d_y); the components not ``observed`` (..., e_y) are marginalised exactly.
+
+    With ``iterations`` > 1 the law is linearised again about the posterior: the iterated extended filter for `Taylor`,
+    iterated posterior linearisation for quadratures.
+
+    Source: Garcia-Fernandez, Svensson, Morelande, Särkkä, IEEE TSP 63 (2015), for the iterated form.
+    """
+    line = rule.linearize(law, prior, None, None)
+    result = _condition(prior, line, None, y, observed)
+    for _ in range(iterations - 1):
+        posterior = result.belief
+        line = rule.linearize(law, posterior, None, None)
+        # slope S_posterior^-1 is the law's Jacobian; carry it back to the prior's own factor and mean.
+        jacobian = torch.linalg.solve_triangular(posterior.factor(), line.slope, upper=False, left=False)
+        line = line._replace(slope=jacobian @ prior.factor())
+        back = (jacobian @ posterior.space.local(posterior.mean, prior.mean).unsqueeze(-1)).squeeze(-1)
+        result = _condition(prior, line, back, y, observed)
+    return result
+
+
+def _condition(
+    prior: Gaussian, line: Linearization, shift: Tensor | None, y: Tensor, observed: Tensor | None
+) -> Update:
+    """Square-root measurement update: one triangularisation gives innovation factor, gain and posterior factor.
+
+    Source: Kailath, Sayed, Hassibi, Linear Estimation (2000), section 12.3, the array form.
+    """
+    top, negative = cat_columns(line.slope, line.spread()), line.negative
+    filled = y if observed is None else torch.where(torch.isnan(y), line.mean, y)
+    innovation = line.space.local(line.mean, filled)
+    if shift is not None:
+        innovation = innovation - shift
+    m = top.shape[-2]
+    counted: Tensor | int = m
+    if observed is not None:
+        innovation = torch.where(observed, innovation, 0)
+        top = mask_rows(top, observed)
+        negative = None if negative is None else torch.where(observed, negative, 0)
+        counted = observed.sum(-1).to(y.dtype)
+    root = prior.factor()
+    factor = triangularize(_stack_rows(top, root))
+    if negative is not None:
+        factor = cholesky_downdate(factor, torch.nn.functional.pad(negative, (0, root.shape[-1])))
+    innovation_factor, gain, posterior_factor = factor[..., :m, :m], factor[..., m:, :m], factor[..., m:, m:]
+    z = whiten(innovation_factor, innovation)
+    nis = z.square().sum(-1)
+    log_likelihood = -0.5 * nis - log_abs_diagonal(innovation_factor) - 0.5 * LOG_2PI * counted
+    mean = prior.space.retract(prior.mean, apply_factor(gain, z))
+    posterior = Gaussian(mean, posterior_factor, prior.space)
+    return Update(posterior, log_likelihood, innovation, innovation_factor, nis)
+
+
+def _stack_rows(top: Tensor, root: Tensor) -> Tensor:
+    """``[[top], [root, 0]]`` with leading dims broadcast."""
+    bottom = torch.nn.functional.pad(root, (0, top.shape[-1] - root.shape[-1]))
+    lead = torch.broadcast_shapes(top.shape[:-2], bottom.shape[:-2])
+    return torch.cat([top.expand(*lead, *top.shape[-2:]), bottom.expand(*lead, *bottom.shape[-2:])], -2)

@@ -1,0 +1,77 @@
+"""A weighted cloud of points, or of small Gaussians."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfilt.spaces import EUCLIDEAN, Space, weighted_sum
+
+
+class Particles(NamedTuple):
+    """Particles x (*batch, n, d) with normalised log-weights (*batch, n).
+
+    scale_tril (*batch, n, e, e), or (*batch, 1, e, e) when all particles share it, makes each particle a Gaussian;
+    None means points.
+    """
+
+    x: Tensor
+    log_weights: Tensor
+    scale_tril: Tensor | None = None
+    space: Space = EUCLIDEAN
+
+    @property
+    def weights(self) -> Tensor:
+        """Normalised weights (*batch, n)."""
+        return self.log_weights.exp()
+
+    @property
+    def mean(self) -> Tensor:
+        """Intrinsic weighted mean (*batch, d)."""
+        return self.space.mean(self.x, self.weights)
+
+    @property
+    def covariance(self) -> Tensor:
+        """Spread of the particles plus the mean of their own covariances (*batch, e, e)."""
+        return self.moments()[1]
+
+    @property
+    def ess(self) -> Tensor:
+        """Effective sample size, 1 / sum of squared weights, (*batch)."""
+        return torch.exp(-torch.logsumexp(2 * self.log_weights, -1))
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Mean (*batch, d) and covariance (*batch, e, e) of the mixture."""
+        weights = self.weights
+        mean = self.space.mean(self.x, weights)
+        covariance = second_moment(self.space.local(mean.unsqueeze(-2), self.x), weights)
+        if self.scale_tril is not None:
+            covariance = covariance + self._local_covariance(weights)
+        return mean, covariance
+
+    def _local_covariance(self, weights: Tensor) -> Tensor:
+        assert self.scale_tril is not None
+        own = self.scale_tril @ self.scale_tril.mT
+        if own.shape[-3] == 1:
+            return own.squeeze(-3)
+        return (own * weights[..., None, None]).sum(-3)
+
+
+def second_moment(deviation: Tensor, weights: Tensor) -> Tensor:
+    """Weighted sum of outer products of deviations (*batch, n, e): elementwise, so the same bits for any thread count."""
+    by_component = deviation.movedim(-1, 0)
+    weighted = by_component * weights
+    size = deviation.shape[-1]
+    rows = [(weighted[i] * by_component[: i + 1]).sum(-1) for i in range(size)]
+    lower = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)  # (e, e, *batch), zeros above the diagonal
+    lower = lower.movedim((0, 1), (-2, -1))
+    return lower + lower.tril(-1).mT
+
+
+def uniform_log_weights(shape: torch.Size | tuple[int, ...], like: Tensor) -> Tensor:
+    """Equal log-weights of ``shape`` (*batch, n)."""
+    return torch.full(shape, -math.log(shape[-1]), dtype=like.dtype, device=like.device)
+
+
+__all__ = ["Particles", "second_moment", "uniform_log_weights", "weighted_sum"]

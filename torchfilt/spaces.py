@@ -1,0 +1,254 @@
+"""Where a state or a measurement lives: Euclidean axes, angles, unit quaternions and products of them.
+
+A space turns a tangent vector (the error, e numbers) into a point (d numbers) and back:
+``retract(x, v)`` walks from x along v; ``local(x, y)`` is the v that leads from x to y. Everything else
+(sampling, densities, innovations, means, covariances) follows from the two.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import roma
+import torch
+from torch import Tensor
+
+
+@runtime_checkable
+class Space(Protocol):
+    """What filters ask of a space; points are (..., d), tangent vectors (..., e)."""
+
+    @property
+    def size(self) -> int | None:
+        """Numbers in a point, d; None where any number will do."""
+        ...
+
+    @property
+    def tangent_size(self) -> int | None:
+        """Numbers in a tangent vector, e."""
+        ...
+
+    def retract(self, x: Tensor, v: Tensor) -> Tensor:
+        """Point reached from x by the tangent vector v."""
+        ...
+
+    def local(self, x: Tensor, y: Tensor) -> Tensor:
+        """Tangent vector at x that leads to y (the shortest one)."""
+        ...
+
+    def project(self, x: Tensor) -> Tensor:
+        """Nearest point of the space: undoes rounding, not modelling errors."""
+        ...
+
+    def mean(self, points: Tensor, weights: Tensor) -> Tensor:
+        """Intrinsic mean of points (..., n, d) with weights (..., n) that sum to one."""
+        ...
+
+    def observed(self, y: Tensor) -> Tensor:
+        """Which tangent components (..., e) of a measurement are there: NaN means not measured."""
+        ...
+
+
+def weighted_sum(values: Tensor, weights: Tensor) -> Tensor:
+    """Sum over n of weights (..., n) times values (..., n, d): the same bits for any thread count."""
+    return (values * weights.unsqueeze(-1)).sum(-2)
+
+
+@dataclass(frozen=True)
+class Euclidean:
+    """Plain vectors of ``size`` numbers (any number when None)."""
+
+    size: int | None = None
+
+    @property
+    def tangent_size(self) -> int | None:
+        """The same as ``size``."""
+        return self.size
+
+    def retract(self, x: Tensor, v: Tensor) -> Tensor:
+        """``x + v``."""
+        return x + v
+
+    def local(self, x: Tensor, y: Tensor) -> Tensor:
+        """``y - x``."""
+        return y - x
+
+    def project(self, x: Tensor) -> Tensor:
+        """``x`` itself."""
+        return x
+
+    def mean(self, points: Tensor, weights: Tensor) -> Tensor:
+        """Weighted sum."""
+        return weighted_sum(points, weights)
+
+    def observed(self, y: Tensor) -> Tensor:
+        """Each number on its own."""
+        return ~torch.isnan(y)
+
+
+EUCLIDEAN = Euclidean()
+
+
+def wrap_angle(x: Tensor) -> Tensor:
+    """Angle in [-pi, pi] rad equal to x modulo a turn; exact where x is already inside."""
+    turns = torch.round(x / (2 * torch.pi))
+    return x - turns * (2 * torch.pi)
+
+
+@dataclass(frozen=True)
+class Angle:
+    """``size`` independent angles in radians; every difference is wrapped to [-pi, pi]."""
+
+    size: int = 1
+
+    @property
+    def tangent_size(self) -> int:
+        """The same as ``size``."""
+        return self.size
+
+    def retract(self, x: Tensor, v: Tensor) -> Tensor:
+        """Wrapped sum."""
+        return wrap_angle(x + v)
+
+    def local(self, x: Tensor, y: Tensor) -> Tensor:
+        """Wrapped difference."""
+        return wrap_angle(y - x)
+
+    def project(self, x: Tensor) -> Tensor:
+        """Wrapped angle."""
+        return wrap_angle(x)
+
+    def mean(self, points: Tensor, weights: Tensor) -> Tensor:
+        """Circular start, then the intrinsic iteration."""
+        start = torch.atan2(weighted_sum(points.sin(), weights), weighted_sum(points.cos(), weights))
+        return _intrinsic_mean(self, points, weights, start)
+
+    def observed(self, y: Tensor) -> Tensor:
+        """Each angle on its own."""
+        return ~torch.isnan(y)
+
+
+@dataclass(frozen=True)
+class UnitQuaternion:
+    """Rotations as unit quaternions, order x y z w (RoMa's); q and -q are the same point.
+
+    The tangent is a rotation vector in rad. ``side="right"`` puts the error on the right, ``q * exp(v)`` (body axes of a
+    body-to-world quaternion); ``"left"`` puts it on the left, ``exp(v) * q`` (world axes).
+    """
+
+    side: str = "right"
+
+    def __post_init__(self) -> None:
+        if self.side not in ("left", "right"):
+            raise ValueError(f"side must be 'left' or 'right', got {self.side!r}")
+
+    @property
+    def size(self) -> int:
+        """Four numbers."""
+        return 4
+
+    @property
+    def tangent_size(self) -> int:
+        """Three numbers."""
+        return 3
+
+    def retract(self, x: Tensor, v: Tensor) -> Tensor:
+        """Rotation x turned by the rotation vector v; the norm is restored."""
+        x, step = torch.broadcast_tensors(x, roma.rotvec_to_unitquat(v))
+        turned = roma.quat_product(x, step) if self.side == "right" else roma.quat_product(step, x)
+        return self.project(turned)
+
+    def local(self, x: Tensor, y: Tensor) -> Tensor:
+        """Rotation vector (at most pi long) that turns x into y."""
+        x, y = torch.broadcast_tensors(x, y)
+        inverse = roma.quat_conjugation(x)
+        turn = roma.quat_product(inverse, y) if self.side == "right" else roma.quat_product(y, inverse)
+        return roma.unitquat_to_rotvec(turn)
+
+    def project(self, x: Tensor) -> Tensor:
+        """Normalised quaternion."""
+        return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True)
+
+    def mean(self, points: Tensor, weights: Tensor) -> Tensor:
+        """Sign-aligned normalised average, then the intrinsic iteration.
+
+        Source: Pennec, Computing the mean of geometric features, INRIA report 3371 (1998).
+        """
+        reference = points[..., :1, :]
+        aligned = torch.where((points * reference).sum(-1, keepdim=True) < 0, -points, points)
+        return _intrinsic_mean(self, points, weights, self.project(weighted_sum(aligned, weights)))
+
+    def observed(self, y: Tensor) -> Tensor:
+        """All of it or nothing."""
+        return (~torch.isnan(y).any(-1, keepdim=True)).expand(*y.shape[:-1], 3)
+
+
+class Product:
+    """Several spaces side by side: ``Product(Euclidean(6), UnitQuaternion())`` has d = 10, e = 9."""
+
+    def __init__(self, *spaces: Space) -> None:
+        if not spaces:
+            raise ValueError("Product needs at least one space")
+        for space in spaces:
+            if space.size is None or space.tangent_size is None:
+                raise ValueError(f"a space inside a Product must state its size, got {space!r}; write Euclidean(n)")
+        self.spaces = spaces
+        self._sizes = [int(space.size or 0) for space in spaces]
+        self._tangent_sizes = [int(space.tangent_size or 0) for space in spaces]
+
+    def __repr__(self) -> str:
+        return f"Product({', '.join(map(repr, self.spaces))})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Product) and self.spaces == other.spaces
+
+    def __hash__(self) -> int:
+        return hash(self.spaces)
+
+    @property
+    def size(self) -> int:
+        """Sum of the sizes."""
+        return sum(self._sizes)
+
+    @property
+    def tangent_size(self) -> int:
+        """Sum of the tangent sizes."""
+        return sum(self._tangent_sizes)
+
+    def retract(self, x: Tensor, v: Tensor) -> Tensor:
+        """Each part along its own tangent."""
+        parts = zip(self.spaces, x.split(self._sizes, -1), v.split(self._tangent_sizes, -1), strict=True)
+        return torch.cat([space.retract(a, b) for space, a, b in parts], -1)
+
+    def local(self, x: Tensor, y: Tensor) -> Tensor:
+        """Each part's own tangent vector."""
+        parts = zip(self.spaces, x.split(self._sizes, -1), y.split(self._sizes, -1), strict=True)
+        return torch.cat([space.local(a, b) for space, a, b in parts], -1)
+
+    def project(self, x: Tensor) -> Tensor:
+        """Each part by its own rule."""
+        parts = zip(self.spaces, x.split(self._sizes, -1), strict=True)
+        return torch.cat([space.project(a) for space, a in parts], -1)
+
+    def mean(self, points: Tensor, weights: Tensor) -> Tensor:
+        """Each part's own mean."""
+        parts = zip(self.spaces, points.split(self._sizes, -1), strict=True)
+        return torch.cat([space.mean(a, weights) for space, a in parts], -1)
+
+    def observed(self, y: Tensor) -> Tensor:
+        """Each part by its own rule."""
+        parts = zip(self.spaces, y.split(self._sizes, -1), strict=True)
+        return torch.cat([space.observed(a) for space, a in parts], -1)
+
+
+def _intrinsic_mean(space: Space, points: Tensor, weights: Tensor, start: Tensor, iterations: int = 20) -> Tensor:
+    """Fixed-point iteration ``m <- retract(m, sum of w local(m, x))``; rows stop one by one, never because of others."""
+    mean = start
+    tolerance = 8 * torch.finfo(points.dtype).eps
+    active = torch.ones(mean.shape[:-1], dtype=torch.bool, device=mean.device).unsqueeze(-1)
+    for _ in range(iterations):
+        step = weighted_sum(space.local(mean.unsqueeze(-2), points), weights)
+        mean = torch.where(active, space.retract(mean, step), mean)
+        active = active & (step.abs().amax(-1, keepdim=True) > tolerance)
+        if not torch.compiler.is_compiling() and not active.any():
+            break
+    return mean
