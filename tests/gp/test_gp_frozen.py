@@ -14,7 +14,7 @@ from oracles import gp_oracle
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchfilt.gp import FrozenGP, IntegrityError
-from torchfilt.gp.storage import manifest_path
+from torchfilt.storage import manifest_path
 
 KERNELS = [("structured", False), ("structured", True), ("ard", False), ("ard", True), ("isotropic", False)]
 
@@ -245,7 +245,7 @@ def test_refuses_foreign_and_cut_files(make, tmp_path):
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(IntegrityError, match=r"gp\.npz.*truncated or altered"):
         FrozenGP.load(path)
-    from torchfilt.gp.storage import write_verified
+    from torchfilt.storage import write_verified
 
     write_verified(path, b"anything", "something else")
     with pytest.raises(IntegrityError, match="something else"):

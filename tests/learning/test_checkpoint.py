@@ -14,8 +14,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from torchfilt.gp.storage import IntegrityError, manifest_path, write_verified
 from torchfilt.learning.checkpoint import FILE_KIND, AtomicCheckpointIO, load_checkpoint, save_checkpoint
+from torchfilt.storage import IntegrityError, manifest_path, write_verified
 
 
 def test_round_trip_of_plain_values(tmp_path):

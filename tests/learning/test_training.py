@@ -10,9 +10,9 @@ import torch
 from learning_problem import pairs, phase
 
 from torchfilt.gp import FrozenGP
-from torchfilt.gp.storage import IntegrityError
 from torchfilt.learning import GPModule, TransitionData, one_step_error, roll_out, roll_out_error, train_transition
 from torchfilt.learning.checkpoint import load_checkpoint
+from torchfilt.storage import IntegrityError
 
 OPTIONS = {"dt": 1.0, "context": phase}
 

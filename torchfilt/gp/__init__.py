@@ -10,7 +10,7 @@ from typing import Any
 _HOMES = {
     "Collapsed": "frozen",
     "FrozenGP": "frozen",
-    "IntegrityError": "storage",
+    "IntegrityError": "frozen",
     "GPTransition": "transition",
     "Novelty": "transition",
     "one_step_targets": "transition",

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from torchfilt.gp.storage import IntegrityError, read_verified, write_verified
+from torchfilt.storage import IntegrityError, read_verified, write_verified
 
 Kind = Literal["structured", "dense"]
 FILE_KIND = "torchfilt frozen Gaussian process"

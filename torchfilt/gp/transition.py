@@ -75,7 +75,7 @@ class GPTransition(nn.Module):
         noise: "predictive" adds the learned noise variance (what the kernel cannot explain is an error of the next
             step too); "latent" leaves it out.
         pooling: how `pooled` forms the one variance of a sigma-point set: the weighted "average" over the points, or
-            the variance at their "centre", which saves a dense GP most of its work and differs by the variance's curvature.
+            the variance at their "centre", which saves a dense GP most of its work and differs by its curvature.
         dt: time step of the training pairs, s; default what the file says. A step of another length is refused
             (a float: ValueError; a tensor: NaN rows), zero means no motion.
         space: Euclidean.

@@ -1,4 +1,4 @@
-"""Checkpoints that are whole, verified and never unpickled: Lightning's door to `torchfilt.gp.storage`."""
+"""Checkpoints that are whole, verified and never unpickled: Lightning's door to `torchfilt.storage`."""
 
 import io
 import pickle
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from pytorch_lightning.plugins import CheckpointIO
 
-from torchfilt.gp.storage import IntegrityError, read_verified, remove_verified, write_verified
+from torchfilt.storage import IntegrityError, read_verified, remove_verified, write_verified
 
 FILE_KIND = "torchfilt checkpoint"
 

@@ -1,4 +1,4 @@
-"""Figures of a training run, drawn without pyplot so that no global figure state exists; matplotlib loads when called."""
+"""Figures of a training run, drawn without pyplot: no global figure state. Matplotlib loads when called."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
