@@ -74,7 +74,7 @@ def test_left_out_errors_and_calibration(make, shared):
     regression = make("structured", shared, count=20, noise=1e-2)
     y = regression.standardized()[1].numpy()
     noise = regression.likelihood.noise.detach().flatten().expand(P).numpy()
-    error, variance = regression.leave_one_out()
+    error, variance = regression.left_out()
     for i in range(P):
         expected = gp_oracle.leave_one_out(prior_of(regression, i), y[:, i], noise[i])
         np.testing.assert_allclose(error[:, i].numpy(), expected[0].astype(float), rtol=1e-7)
@@ -86,7 +86,7 @@ def test_left_out_errors_and_calibration(make, shared):
         regression.kernel.deviation = regression.kernel.deviation * 0.1
     factors = regression.calibrate()
     assert (factors > 1).all()
-    error, variance = regression.leave_one_out()
+    error, variance = regression.left_out()
     ratio = (error.square() / variance).mean(0)
     assert (ratio.mean() if shared else ratio).numpy() == pytest.approx(1.0)
     assert (regression.calibrate() - 1).abs().max() < 1e-9

@@ -3,11 +3,10 @@
 Each query is its own test point: rows never share noise and memory grows with the queries, not with their square.
 Two forms, one interface:
 
-* *structured* (affine in the state, periodic in a phase). On the unit circle the squared exponential is a Fourier
-  series, exp(-|f - f'|^2 / 2 l^2) = sum_n c_n cos n(u - u'), with c_n from Bessel functions that fall faster than any
-  power: the process *is* a Bayesian linear regression on (harmonics of u) x (1, x), exact to rounding. Its posterior is
-  held as weights and a factor of their covariance; no difference of large numbers is left, so variances 1e-12 of the
-  prior keep their digits, float32 included, and the cost of a query does not depend on the number of training pairs.
+* *structured* (affine in the state, periodic in a phase): a Bayesian linear regression on (harmonics of u) x (1, x),
+  see `fourier`. Its posterior is held as weights and a factor of their covariance; no difference of large numbers is
+  left, so variances 1e-12 of the prior keep their digits, float32 included, and the cost of a query does not depend on
+  the number of training pairs.
 * *dense* (squared exponential with one or D length-scales, exact or with inducing points): cached Cholesky factor and
   weights; variance by a triangular solve.
 """
@@ -21,12 +20,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from torchfilt.gp.fourier import harmonics
 from torchfilt.storage import IntegrityError, read_verified, write_verified
 
 Kind = Literal["structured", "dense"]
 FILE_KIND = "torchfilt frozen Gaussian process"
-# Coefficients below this share of the whole are dropped: far under the noise floor squared (1e-10) and under rounding.
-_SERIES_TAIL = 1e-22
 
 
 class Collapsed(NamedTuple):
@@ -76,35 +74,6 @@ def _each(matrix: Tensor, vectors: Tensor) -> Tensor:
     if matrix.shape[-3] == 1 and vectors.dim() > 1:
         return vectors @ matrix.squeeze(-3).mT
     return (matrix * vectors.unsqueeze(-2)).sum(-1)
-
-
-def harmonics(phase: Tensor, count: int) -> Tensor:
-    """(1, cos u, ..., cos Mu, sin u, ..., sin Mu) of phase (..., 2) = (cos u, sin u); returns (..., 2M + 1)."""
-    orders = torch.arange(1, count + 1, dtype=phase.dtype, device=phase.device)
-    angle = torch.atan2(phase[..., 1:], phase[..., :1]) * orders
-    return torch.cat([torch.ones_like(phase[..., :1]), angle.cos(), angle.sin()], -1)
-
-
-def series_roots(lengthscale: Tensor) -> Tensor:
-    """Square roots of the Fourier coefficients of the squared exponential on the unit circle.
-
-    Args:
-        lengthscale: (p,), of the chord |f - f'|.
-
-    Returns:
-        (p, 2M + 1) in the order of `harmonics`; M is where every series has fallen below 1e-22.
-
-    Source: Abramowitz and Stegun, 9.6.34 (generating function of the modified Bessel functions).
-    """
-    from scipy.special import ive  # needed at freezing only
-
-    kappa = lengthscale.detach().double().cpu().square().reciprocal().numpy()[:, None]
-    count = 4
-    while float(ive(count + 1, kappa).max()) > _SERIES_TAIL:
-        count += 1
-    orders = torch.arange(count + 1).numpy()[None]
-    c = torch.as_tensor(ive(orders, kappa))
-    return torch.cat([c[:, :1], 2 * c[:, 1:], 2 * c[:, 1:]], 1).sqrt()
 
 
 class _Structured(nn.Module):
@@ -360,44 +329,3 @@ class FrozenGP(nn.Module):
             return cls(head["kind"], inner, noise, head["state_size"], head["settings"])
         except (KeyError, ValueError, TypeError, OSError) as error:
             raise IntegrityError(f"{path}: not a frozen Gaussian process of this version ({error})") from None
-
-
-def freeze_structured(
-    z: Tensor, phase: Tensor, y: Tensor, prior: Tensor, lengthscale: Tensor, noise: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Posterior weights and factor of the structured GP in standardised units.
-
-    Args:
-        z: (S, d) standardised states. phase: (S, 2) on the unit circle. y: (S, p) standardised outputs.
-        prior: (p, 1 + d) prior standard deviations. lengthscale: (p,). noise: (p,) variances.
-
-    Returns:
-        weights (H, p, 1 + d) and factor (H, p, 1 + d, K), see `_Structured`.
-
-    Raises:
-        ValueError: a phase is off the unit circle.
-    """
-    off = (torch.linalg.vector_norm(phase, dim=-1) - 1).abs().max().item() if len(phase) else 0.0
-    if off > 1e-6:
-        raise ValueError(
-            f"the context of a structured GP is (cos u, sin u) on the unit circle, largest miss is {off:.3g}"
-        )
-    roots = series_roots(lengthscale).to(z)
-    f = harmonics(phase, (roots.shape[1] - 1) // 2)
-    h = pad(z, (1, 0), value=1.0)
-    scale = (roots.unsqueeze(-1) * prior.unsqueeze(-2)).flatten(-2)  # (p, K)
-    products = (f.unsqueeze(-1) * h.unsqueeze(-2)).flatten(-2)  # (S, K)
-    # Ridge regression through one QR of [design / noise; I]: the normal equations would square the condition number.
-    deviation = noise.sqrt()[:, None, None]
-    design = products * scale.unsqueeze(-2) / deviation
-    size = scale.shape[-1]
-    identity = torch.eye(size, dtype=z.dtype, device=z.device).expand(len(prior), size, size)
-    q, r = torch.linalg.qr(torch.cat([design, identity], -2))
-    data = q[:, : len(z)].mT @ (y.mT.unsqueeze(-1) / deviation)
-    weights = torch.linalg.solve_triangular(r, data, upper=True).squeeze(-1) * scale
-    factor = torch.linalg.solve_triangular(r, identity, upper=True) * scale.unsqueeze(-1)
-    count, width = f.shape[-1], h.shape[-1]
-    return (
-        weights.unflatten(-1, (count, width)).transpose(0, 1).contiguous(),
-        factor.unflatten(-2, (count, width)).transpose(0, 1).contiguous(),
-    )

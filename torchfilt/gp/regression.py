@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchfilt.gaussian import LOG_2PI
-from torchfilt.gp.frozen import FrozenGP, freeze_structured
+from torchfilt.gp.fourier import WeightPosterior, weight_posterior
+from torchfilt.gp.frozen import FrozenGP
 
 KernelName = Literal["structured", "ard", "isotropic"]
 # A phase length-scale below this chord (about 11 degrees) would need more harmonics than training sets can feed.
@@ -237,25 +238,53 @@ class GPRegression(nn.Module):
         return mean.mT * self.output_scale + self.output_mean, variance.mT * self.output_scale.square()
 
     @torch.no_grad()
-    def leave_one_out(self) -> tuple[Tensor, Tensor]:
-        """Errors (S, p) and predictive variances (S, p) of each training output given all others, standardised units.
+    def left_out(self, groups: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Errors (S, p) and predictive variances (S, p) of training outputs given the others, standardised units.
 
-        Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, eqs. 5.10 to 5.12.
+        Args:
+            groups: (S,) integers; samples of one group are left out together, as neighbours along a trajectory must be:
+                given each other they are all but known. None leaves out one at a time.
+
+        Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, section 5.4.2, for blocks.
         """
         z, y = self.standardized()
-        factor = self._checked_factor(z)
-        precision = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1).mT
-        return self._solve(y, factor).mT / precision, (1 / precision).expand_as(y)
+        noise = self.likelihood.noise.flatten()
+        if isinstance(self.kernel, StructuredKernel):
+            weights = self._weights()
+            # (K + noise)^-1 = (1 - B B^T) / noise, and applied to y the residual / noise: no kernel matrix is formed.
+            basis, white, scale = weights.basis, weights.residual, noise.expand(y.shape[-1])
+
+            def precision(rows: Tensor) -> Tensor:
+                part = basis[:, rows]
+                return torch.eye(len(rows), dtype=z.dtype, device=z.device) - part @ part.mT
+        else:
+            factor = self._checked_factor(z)
+            inverse = torch.cholesky_inverse(factor)
+            white, scale = self._solve(y, factor), torch.ones_like(noise)
+
+            def precision(rows: Tensor) -> Tensor:
+                return inverse[:, rows][..., rows]
+
+        names = torch.arange(len(y), device=z.device) if groups is None else groups
+        error, variance = torch.empty_like(y), torch.empty_like(y)
+        for name in names.unique():
+            rows = (names == name).nonzero().squeeze(-1)
+            covariance = torch.linalg.inv(precision(rows))
+            error[rows] = (covariance @ white[:, rows].unsqueeze(-1)).squeeze(-1).mT
+            variance[rows] = (scale[:, None] * covariance.diagonal(dim1=-2, dim2=-1)).mT
+        return error, variance
 
     @torch.no_grad()
-    def calibrate(self) -> Tensor:
-        """Inflate kernel and noise until left-out errors are no larger than predicted; returns the factors (q,), at
-        least 1.
+    def calibrate(self, groups: Tensor | None = None) -> Tensor:
+        """Inflate kernel and noise until left-out errors are no larger than predicted; returns the factors (q,) >= 1.
 
         A marginal likelihood maximised on a misfit that is not Gaussian, or on a subset, claims too much by 10 to 50 %.
         The posterior mean does not change. Variances are never made smaller.
+
+        Args:
+            groups: (S,) integers of samples that are left out together, see `left_out`.
         """
-        error, variance = self.leave_one_out()
+        error, variance = self.left_out(groups)
         ratio = (error.square() / variance).mean(0)
         factors = (ratio.mean().unsqueeze(0) if self.shared else ratio).clamp_min(1.0)
         self.likelihood.noise = self.likelihood.noise * factors.unsqueeze(-1)
@@ -264,6 +293,19 @@ class GPRegression(nn.Module):
         else:
             self.kernel.outputscale = self.kernel.outputscale * factors
         return factors
+
+    def _weights(self) -> WeightPosterior:
+        """Weight-space posterior of the structured kernel on all training data.
+
+        In double precision whatever the dtype: done once, and it decides the variances' digits.
+        """
+        assert isinstance(self.kernel, StructuredKernel)
+        z, y = self.standardized()
+        outputs, d = y.shape[-1], self.state.shape[-1]
+        prior = self.kernel.deviation.squeeze(-2).expand(outputs, -1)
+        lengthscale = self.kernel.phase_lengthscale.expand(outputs)
+        noise = self.likelihood.noise.flatten().expand(outputs)
+        return weight_posterior(*(t.double() for t in (z[:, :d], z[:, d:], y, prior, lengthscale, noise)))
 
     def _solve(self, y: Tensor, factor: Tensor) -> Tensor:
         """(kernel + noise)^-1 y for outputs y (S, p); returns (p, S)."""
@@ -305,13 +347,10 @@ class GPRegression(nn.Module):
         noise = self.likelihood.noise.flatten().expand(outputs)
         common = {"input_mean": self.input_mean, "input_scale": self.input_scale}
         if isinstance(self.kernel, StructuredKernel):
-            # One batched QR, in double precision whatever the dtype: done once, and it decides the variances' digits.
+            posterior = self._weights()
             prior = self.kernel.deviation.squeeze(-2).expand(outputs, -1)
-            lengthscale = self.kernel.phase_lengthscale.expand(outputs)
-            doubles = [t.double() for t in (z[:, :d], z[:, d:], y, prior, lengthscale, noise)]
-            weights, factor = freeze_structured(*doubles)
             scale = self.output_scale.double()[:, None]
-            weights, factor = weights * scale, factor * scale.unsqueeze(-1)
+            weights, factor = posterior.weights * scale, posterior.factor * scale.unsqueeze(-1)
             weights[0, :, 0] += self.output_mean  # the zeroth harmonic of the constant
             tensors = {
                 "weights": weights.to(z),

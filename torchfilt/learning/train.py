@@ -1,6 +1,7 @@
 """From one-step pairs to a transition law in one call."""
 
 import contextlib
+import copy
 import json
 import logging
 import sys
@@ -15,15 +16,18 @@ import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback, EarlyStopping, ModelCheckpoint, TQDMProgressBar
 from pytorch_lightning.loggers import CSVLogger, Logger, TensorBoardLogger
+from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
+from torchfilt.gp.frozen import FrozenGP
 from torchfilt.gp.regression import GPRegression, KernelName
 from torchfilt.gp.sparse import SparseGPRegression
 from torchfilt.gp.transition import GPTransition, Target, one_step_targets
 from torchfilt.learning.checkpoint import AtomicCheckpointIO, load_checkpoint
 from torchfilt.learning.data import TransitionData
 from torchfilt.learning.module import GPModule, OptimizerName
+from torchfilt.storage import atomic_write
 
 CHECKPOINT = "last.ckpt"
 FROZEN = "gp.npz"
@@ -34,7 +38,7 @@ class TrainingReport:
     """What a training did.
 
     Attributes:
-        loss: last negative log marginal likelihood (or bound) per sample, summed over outputs, standardised units.
+        loss: final negative log marginal likelihood (or bound) per sample, summed over outputs, standardised units.
         epochs: Lightning epochs done in all, resumed ones included.
         seconds: wall time of the fit alone.
         samples: pairs the posterior is conditioned on. hyperparameter_samples: pairs the hyperparameters saw.
@@ -60,13 +64,13 @@ class TrainingReport:
 
 
 class _StopWhen(Callback):
-    """Ends the fit after the epoch in which ``stop()`` turned true, so that its checkpoint is whole."""
+    """Ends the fit after the epoch in which ``stop()`` turned true: a checkpoint in mid-epoch could not be resumed."""
 
     def __init__(self, stop: Callable[[], bool]) -> None:
         self.stop = stop
         self.stopped = False
 
-    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any, **kwargs: Any) -> None:
+    def on_train_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self.stop():
             self.stopped = True
             trainer.should_stop = True
@@ -85,6 +89,7 @@ def train_transition(
     shared: bool = False,
     standardize: bool = True,
     calibrate: bool = True,
+    groups: Tensor | None = None,
     noise_floor: float = 1e-5,
     process_noise_scale_tril: Tensor | None = None,
     hyperparameter_samples: int | None = 250,
@@ -101,11 +106,13 @@ def train_transition(
     progress: bool | None = None,
     tensorboard: bool = False,
     stop: Callable[[], bool] | None = None,
+    dtype: torch.dtype | None = None,
 ) -> tuple[GPTransition, TrainingReport]:
     """Learn one-step dynamics from pairs.
 
     Args:
-        x: (S, d) states. u: (S, k) controls or None. x_next: (S, d) states dt later. Their dtype rules.
+        x: (S, d) states. u: (S, k) controls or None. x_next: (S, d) states dt later. The nominal law is called in
+            their dtype; the regression itself runs in double precision, which noise floors of 1e-5 need.
         nominal: law(x, u, dt) -> Gaussian whose residual is learned, or None.
         dt: time step, s.
         context: function of u giving inputs beyond the state (..., c); the structured kernel needs (cos u, sin u).
@@ -114,6 +121,7 @@ def train_transition(
         hyperparameter_samples: rows (a random subset) the marginal likelihood is maximised on; the posterior is
             conditioned on all. None for all.
         calibrate: inflate the variances of an exact GP until left-out errors are honest, see `GPRegression.calibrate`.
+        groups: (S,) integers of samples left out together in that (the arcs they come from), None for one at a time.
         inducing: number of inducing points for the sparse form (kernel "ard" or "isotropic"), None for the exact GP.
         batch_size: minibatch of the sparse form.
         optimizer: "lbfgs" for the exact GP and "adam" for the sparse one by default; learning_rate is Adam's.
@@ -124,7 +132,9 @@ def train_transition(
         resume: go on from the checkpoint in run_dir, to the same bits as an uninterrupted run.
         progress: show a bar; default only on a terminal.
         tensorboard: log for TensorBoard beside the CSV file.
-        stop: asked after each step; True ends the fit in good order.
+        stop: asked after each epoch; True ends the fit in good order, as SIGTERM does where this is given.
+        dtype: of the returned law, None for that of x. A law of less precision than the data has the rounding of its
+            steps, measured on the training pairs, added to its noise.
 
     Returns:
         The transition law, on the CPU, and the report.
@@ -138,19 +148,32 @@ def train_transition(
     with torch.no_grad():
         targets = one_step_targets(x, u, x_next, dt, target=goal, nominal=nominal)
         features = _context(context, u)
-        features = None if features is None else features.to(x)
+        features = None if features is None else features.double()
     if inducing is not None:
         if kernel == "structured":
             raise ValueError(
                 "the sparse form takes kernel 'ard' or 'isotropic'; the structured kernel needs no inducing points"
             )
         regression: GPRegression = SparseGPRegression(
-            x, targets, features, kernel=kernel, shared=shared, noise_floor=noise_floor, inducing=inducing, seed=seed
+            x.double(),
+            targets.double(),
+            features,
+            kernel=kernel,
+            shared=shared,
+            noise_floor=noise_floor,
+            inducing=inducing,
+            seed=seed,
         )
         rows = None
     else:
         regression = GPRegression(
-            x, targets, features, kernel=kernel, shared=shared, noise_floor=noise_floor, standardize=standardize
+            x.double(),
+            targets.double(),
+            features,
+            kernel=kernel,
+            shared=shared,
+            noise_floor=noise_floor,
+            standardize=standardize,
         )
         rows = _subset(len(x), hyperparameter_samples, seed)
     chosen: OptimizerName = optimizer or ("lbfgs" if inducing is None else "adam")
@@ -159,12 +182,19 @@ def train_transition(
     folder = None if run_dir is None else Path(run_dir)
     outcome = _fit(module, data, limit, chosen, tolerance, device, folder, resume, progress, tensorboard, stop)
     module.to("cpu")
-    loss = outcome.loss if inducing is not None else float(regression.loss(rows).detach())
-    inflation = regression.calibrate().sqrt().tolist() if calibrate and inducing is None else None
-    frozen = regression.freeze({"target": goal, "dt": dt})
-    law = GPTransition(
-        frozen, nominal, context=context, target=goal, process_noise_scale_tril=process_noise_scale_tril, dt=dt
-    )
+    with torch.no_grad():
+        loss = float(regression.loss(rows))
+    inflation = regression.calibrate(groups).sqrt().tolist() if calibrate and inducing is None else None
+    frozen = regression.freeze({"target": goal, "dt": dt}).to(x.dtype)
+
+    def wrap(gp: FrozenGP) -> GPTransition:
+        floor = None if process_noise_scale_tril is None else process_noise_scale_tril.to(gp.noise)
+        return GPTransition(gp, nominal, context=context, target=goal, process_noise_scale_tril=floor, dt=dt)
+
+    law = wrap(frozen)
+    if dtype is not None and dtype != x.dtype:
+        frozen = _cast(law, dtype, x, u, dt)
+        law = wrap(frozen)
     report = TrainingReport(
         loss=loss,
         epochs=outcome.epochs,
@@ -178,13 +208,23 @@ def train_transition(
     )
     if folder is not None and not report.interrupted:
         frozen.save(folder / FROZEN)
-        (folder / "training.json").write_text(json.dumps(report.to_dict(), indent=1) + "\n")
+        atomic_write(folder / "training.json", (json.dumps(report.to_dict(), indent=1) + "\n").encode())
     return law, report
+
+
+@torch.no_grad()
+def _cast(law: GPTransition, dtype: torch.dtype, x: Tensor, u: Tensor | None, dt: float) -> FrozenGP:
+    """The GP in another precision, its noise raised by the variance of what rounding does to a step."""
+    exact = law(x, u, dt).mean
+    gp = copy.deepcopy(law.gp).to(dtype)
+    rounded = GPTransition(gp, law.nominal, context=law.context, target=law.target, noise=law.noise, dt=law.dt)
+    error = rounded(x.to(dtype), u, dt).mean.to(exact) - exact
+    gp.noise += error.square().mean(0).to(dtype)
+    return gp
 
 
 @dataclass(frozen=True)
 class _Outcome:
-    loss: float
     epochs: int
     seconds: float
     interrupted: bool
@@ -240,9 +280,14 @@ def _fit(
             num_sanity_val_steps=0,
         )
         begin = time.perf_counter()
-        trainer.fit(module, datamodule=data, ckpt_path=path, weights_only=True)
-    loss = float(trainer.callback_metrics.get("loss", torch.tensor(torch.nan)))
-    return _Outcome(loss, trainer.current_epoch, time.perf_counter() - begin, stopper.stopped)
+        try:
+            trainer.fit(module, datamodule=data, ckpt_path=path, weights_only=True)
+        except SIGTERMException:
+            # Lightning's own answer to SIGTERM; the checkpoint of the last whole epoch is on disk.
+            if stop is None:
+                raise
+            stopper.stopped = True
+    return _Outcome(trainer.current_epoch, time.perf_counter() - begin, stopper.stopped)
 
 
 @contextlib.contextmanager
@@ -275,7 +320,7 @@ def _check_same_run(module: GPModule, path: Path) -> _Outcome | None:
     if not early.get("stopped_epoch"):
         return None
     module.load_state_dict(stored)
-    return _Outcome(float(early["best_score"]), checkpoint["epoch"] + 1, 0.0, False)
+    return _Outcome(checkpoint["epoch"] + 1, 0.0, False)
 
 
 def _loggers(folder: Path | None, tensorboard: bool) -> list[Logger] | bool:
@@ -283,7 +328,7 @@ def _loggers(folder: Path | None, tensorboard: bool) -> list[Logger] | bool:
         return False
     # Lightning's CSV writer empties a folder that it finds: a resumed run logs beside the first part.
     part = next(n for n in range(1, 10_000) if not (folder / f"log-{n}").exists())
-    result: list[Logger] = [CSVLogger(folder, name="", version=f"log-{part}")]
+    result: list[Logger] = [CSVLogger(folder, name="", version=f"log-{part}", flush_logs_every_n_steps=1)]
     if tensorboard:
         result.append(TensorBoardLogger(folder, name="", version=f"tensorboard-{part}"))
     return result
