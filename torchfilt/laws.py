@@ -7,7 +7,7 @@ broadcastable: u is (*lead, k) and dt is a number or (*lead, 1) where lead broad
 
 import inspect
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +25,6 @@ class LinearForm(NamedTuple):
     scale_tril: Tensor
 
 
-@runtime_checkable
 class HasLinearForm(Protocol):
     """A law that is linear in the state gives its matrices; exact filters and the shared-covariance path use them."""
 
@@ -161,7 +160,7 @@ class AdditiveGaussian(nn.Module):
     ) -> None:
         super().__init__()
         self.function = function
-        self.call = adapt(function)
+        self.style = call_style(function)
         self.noise = _Factor(covariance, scale_tril, trainable)
         self.space = space
         noise_size = self.noise().shape[-1]
@@ -172,33 +171,40 @@ class AdditiveGaussian(nn.Module):
 
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None) -> Gaussian:
         """Law of y given x (..., d)."""
-        return Gaussian(self.call(x, u, dt), self.noise(), self.space)
+        return Gaussian(self.style.call(self.function, x, u, dt), self.noise(), self.space)
 
 
-def adapt(function: Callable[..., object]) -> Callable[..., object]:
-    """Let ``function`` be called as f(x, u, dt) whichever of u and dt it takes, by name or by position."""
+class CallStyle(NamedTuple):
+    """Which of u and dt a function takes, and whether it takes them by name."""
+
+    takes_u: bool
+    takes_dt: bool
+    by_name: bool
+
+    def call(self, function: Callable[..., Any], x: Tensor, u: Tensor | None, dt: Tensor | float | None) -> Any:
+        """``function(x, u, dt)`` without the arguments it does not take."""
+        if self.by_name:
+            named = {name: value for name, value, takes in (("u", u, self.takes_u), ("dt", dt, self.takes_dt)) if takes}
+            return function(x, **named)
+        if self.takes_dt:
+            return function(x, u, dt)
+        return function(x, u) if self.takes_u else function(x)
+
+
+def call_style(function: Callable[..., Any]) -> CallStyle:
+    """Read from the signature: u and dt by their names, else by position in this order; unused ones may be absent."""
     target = function.forward if isinstance(function, nn.Module) else function
     try:
         parameters = list(inspect.signature(target).parameters.values())
     except (TypeError, ValueError):  # a builtin such as torch.sin: takes the state alone
-        return lambda x, u=None, dt=None: function(x)
+        return CallStyle(False, False, False)
     if any(p.kind is p.VAR_POSITIONAL for p in parameters):
-        return lambda x, u=None, dt=None: function(x, u, dt)
-    names = [p.name for p in parameters[1:]]
-    by_name = {"u", "dt"} & set(names)
-    if by_name:
-        takes_u, takes_dt = "u" in by_name, "dt" in by_name
-        if takes_u and takes_dt:
-            return lambda x, u=None, dt=None: function(x, u=u, dt=dt)
-        if takes_u:
-            return lambda x, u=None, dt=None: function(x, u=u)
-        return lambda x, u=None, dt=None: function(x, dt=dt)
+        return CallStyle(True, True, False)
+    named = {p.name for p in parameters[1:] if p.kind is not p.POSITIONAL_ONLY}
+    if named & {"u", "dt"}:
+        return CallStyle("u" in named, "dt" in named, True)
     required = [p for p in parameters[1:] if p.default is p.empty and p.kind is not p.KEYWORD_ONLY]
-    if len(required) == 0:
-        return lambda x, u=None, dt=None: function(x)
-    if len(required) == 1:
-        return lambda x, u=None, dt=None: function(x, u)
-    return lambda x, u=None, dt=None: function(x, u, dt)
+    return CallStyle(len(required) > 0, len(required) > 1, False)
 
 
 def check_finite(tensor: Tensor, name: str) -> None:

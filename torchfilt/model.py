@@ -7,9 +7,9 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import adapt, check_finite
+from torchfilt.laws import call_style, check_finite
 from torchfilt.linalg import psd_factor
-from torchfilt.noise import NoiseSource
+from torchfilt.moments import Missing
 
 Conditional = Gaussian | Distribution
 
@@ -21,6 +21,9 @@ class StateSpaceModel(nn.Module):
         initial: a `Gaussian`, a `torch.distributions.Distribution`, or a module that returns one when called.
         transition: law called as ``transition(x, u, dt)``; arguments it does not take are left out.
         observation: law called as ``observation(x)``.
+
+    Raises:
+        TypeError: initial is none of these, a law is not callable.
     """
 
     def __init__(
@@ -30,9 +33,35 @@ class StateSpaceModel(nn.Module):
         observation: Callable[..., Conditional],
     ) -> None:
         super().__init__()
+        for name, law in (("transition", transition), ("observation", observation)):
+            if not callable(law):
+                raise TypeError(f"{name} must be a law, called as law(x) or law(x, u, dt), got {type(law).__name__}")
         self.initial = initial if isinstance(initial, nn.Module) else InitialLaw(initial)
         self.transition = transition
         self.observation = observation
+        self._styles = {"transition": call_style(transition), "observation": call_style(observation)}
+
+    def conditional(
+        self, name: str, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None
+    ) -> Conditional:
+        """What the law called ``name`` ("transition" or "observation") gives at x."""
+        result: Conditional = self._styles[name].call(getattr(self, name), x, u, dt)
+        return result
+
+    def moments(self, name: str) -> Callable[..., Gaussian]:
+        """The law called ``name`` as (x, u, dt) -> Gaussian; short cuts that it offers stay visible."""
+        law = getattr(self, name)
+        if hasattr(law, "linear_form") or hasattr(law, "pooled"):
+            return law  # type: ignore[no-any-return]
+        return lambda x, u=None, dt=None: as_gaussian(self.conditional(name, x, u, dt))
+
+    def is_linear(self) -> bool:
+        """Whether transition and observation are linear in the state with Gaussian noise and say so."""
+        return hasattr(self.transition, "linear_form") and hasattr(self.observation, "linear_form")
+
+    def prior(self) -> Gaussian:
+        """The initial law by its first two moments."""
+        return as_gaussian(self.initial())
 
 
 class InitialLaw(nn.Module):
@@ -85,27 +114,27 @@ def as_gaussian(law: Conditional) -> Gaussian:
     return Gaussian(law.mean, law.variance.sqrt(), is_diagonal=True)
 
 
-def gaussian_law(law: Callable[..., Conditional]) -> Callable[..., Gaussian]:
-    """The law with its signature filled up and its result adapted by moments."""
-    if hasattr(law, "linear_form") or hasattr(law, "pooled"):
-        return law  # type: ignore[return-value]
-    call = adapt(law)
-    return lambda x, u=None, dt=None: as_gaussian(call(x, u, dt))  # type: ignore[arg-type]
+def log_prob(law: Conditional, y: Tensor, missing: Missing = "rows") -> Tensor:
+    """Log-density of y (..., d) under a conditional law; NaN components are integrated out.
 
-
-def log_prob(law: Conditional, y: Tensor, observed: Tensor | None = None) -> Tensor:
-    """Log-density of y (..., d); components that are not ``observed`` are integrated out.
+    Args:
+        law: one law a row.
+        y: broadcasts with the leading dims of the law.
+        missing: as in `torchfilt.moments.update`.
 
     Raises:
-        ValueError: a joint torch Distribution of several components cannot drop only some of them.
+        ValueError: y has another size than the law, or a joint torch Distribution would have to drop only some of its
+            components.
     """
     if isinstance(law, Gaussian):
-        return law.log_prob(y, observed)
-    if observed is None:
+        if y.shape[-1] != law.mean.shape[-1]:
+            raise ValueError(f"the measurement has {y.shape[-1]} numbers, the observation law {law.mean.shape[-1]}")
+        return law.log_prob(y, None if missing == "none" else law.space.observed(y))
+    if missing == "none":
         value = law.log_prob(y)
         return value if law.event_shape else value.sum(-1)
-    filled = torch.where(torch.isnan(y), law.mean.detach(), y)
-    value = law.log_prob(filled)
+    observed = ~torch.isnan(y)
+    value = law.log_prob(torch.where(observed, y, law.mean.detach()))
     if not law.event_shape:
         return torch.where(observed, value, 0).sum(-1)
     if not (observed.all(-1) | ~observed.any(-1)).all():
@@ -115,11 +144,16 @@ def log_prob(law: Conditional, y: Tensor, observed: Tensor | None = None) -> Ten
     return torch.where(observed.all(-1), value, 0)
 
 
-def sample(law: Conditional, noise: Tensor, source: NoiseSource, step: int, stream: int) -> Tensor:
-    """Draw from a conditional law: a Gaussian uses ``noise``, a torch Distribution its own sampler under a forked seed."""
+def sample(law: Conditional, noise: Tensor, seed: int) -> Tensor:
+    """Draw from a conditional law.
+
+    Args:
+        law: one law a row.
+        noise: standard normals (..., e), used by a Gaussian.
+        seed: used by a torch Distribution, whose own sampler runs under it; the global generator is put back.
+    """
     if isinstance(law, Gaussian):
         return law.sample(noise)
-    seed = source.generator(step, stream, torch.device("cpu")).initial_seed()
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return law.rsample() if law.has_rsample else law.sample()

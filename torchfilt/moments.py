@@ -7,13 +7,12 @@ rest. A quadrature is data; Taylor is the exact derivative. For laws that are li
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
-from torchfilt.laws import HasLinearForm
 from torchfilt.linalg import apply_factor, cholesky_downdate, log_abs_diagonal, triangularize, whiten
 from torchfilt.spaces import EUCLIDEAN, Space
 
@@ -59,8 +58,9 @@ class Taylor:
 
     def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
         """One evaluation and one forward-mode sweep; none for laws that give their linear form."""
-        if isinstance(law, HasLinearForm):
-            matrix, offset, noise = law.linear_form(u, dt)
+        linear_form = getattr(law, "linear_form", None)
+        if linear_form is not None:
+            matrix, offset, noise = linear_form(u, dt)
             mean = apply_factor(matrix, belief.mean)
             return Linearization(
                 mean if offset is None else mean + offset, matrix @ belief.factor(), None, noise, law_space(law)
@@ -82,13 +82,17 @@ class Taylor:
 class Quadrature(NamedTuple):
     """Nodes (s, e) for a standard normal with weights (s,) of the mean and of the covariance.
 
-    ``paired``: nodes are [centre, +c I, -c I], so slope and residual split without a matrix product.
+    ``paired``: nodes are [centre, +c I, -c I], so slope and residual split without a matrix product; ``central`` is then
+    the centre's covariance weight and ``negative`` says whether its mean weight is below zero, both as plain values, so
+    that a compiled step does not branch on tensors.
     """
 
     nodes: Tensor
     mean_weights: Tensor
     covariance_weights: Tensor
     paired: bool
+    central: float = 0.0
+    negative: bool = False
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class SigmaPoints:
         rule = _quadrature(self.build, belief.tangent_size, belief.mean.dtype, belief.mean.device)
         offsets = rule.nodes @ belief.factor().mT
         points = belief.space.retract(belief.mean.unsqueeze(-2), offsets)
-        at_points, noise = _evaluate(law, points, rule.mean_weights, lift(u), lift(dt))
+        at_points, noise = _evaluate(law, points, rule, lift(u), lift(dt))
         space = at_points.space
         mean = space.mean(at_points.mean, rule.mean_weights)
         deviation = space.local(mean.unsqueeze(-2), at_points.mean)
@@ -115,7 +119,7 @@ class SigmaPoints:
 def _split_paired(rule: Quadrature, deviation: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """Rotate each +- pair of columns into its odd part (the slope, exactly) and its even part (the residual)."""
     size = rule.nodes.shape[-1]
-    weight, central = rule.covariance_weights[1], float(rule.covariance_weights[0])
+    weight, central = rule.covariance_weights[1], rule.central
     centre, plus, minus = deviation.split([1, size, size], dim=-2)
     half = torch.sqrt(weight / 2)
     slope = (half * (plus - minus)).mT
@@ -135,9 +139,10 @@ def _split(rule: Quadrature, deviation: Tensor) -> tuple[Tensor, Tensor, Tensor 
 
 
 def _evaluate(
-    law: Law, points: Tensor, weights: Tensor, u: Tensor | None, dt: Tensor | float | None
+    law: Law, points: Tensor, rule: Quadrature, u: Tensor | None, dt: Tensor | float | None
 ) -> tuple[Gaussian, Tensor]:
     """Conditional means at the points and the factor of the weighted mean of the conditional covariances."""
+    weights = rule.mean_weights
     pooled = getattr(law, "pooled", None)
     if pooled is not None:  # the law averages its own noise, cheaper than one factor a point
         result = pooled(points, weights, u, dt)
@@ -148,6 +153,7 @@ def _evaluate(
     if result.is_diagonal:
         varies = scale.dim() > 1 and scale.shape[-2] > 1
         if varies:
+            # A negative centre weight can make the mean variance negative: the square root is then NaN, and the row fails.
             scale = (scale.square() * weights.unsqueeze(-1)).sum(-2).sqrt()
         elif scale.dim() > 1:
             scale = scale.squeeze(-2)
@@ -156,7 +162,7 @@ def _evaluate(
         return result, scale
     if scale.shape[-3] == 1:
         return result, scale.squeeze(-3)
-    if (weights < 0).any():
+    if rule.negative:
         covariance = (scale @ scale.mT * weights[:, None, None]).sum(-3)
         factor, failed = torch.linalg.cholesky_ex(covariance)
         return result, torch.where((failed > 0)[..., None, None], torch.nan, factor)
@@ -164,10 +170,20 @@ def _evaluate(
     return result, triangularize(columns.flatten(-2))
 
 
-@lru_cache(maxsize=64)
+_QUADRATURES: dict[tuple[object, ...], Quadrature] = {}
+
+
 def _quadrature(build: Callable[[int], Quadrature], size: int, dtype: torch.dtype, device: torch.device) -> Quadrature:
-    rule = build(size)
-    return Quadrature(*(part.to(dtype=dtype, device=device) for part in rule[:3]), rule.paired)  # type: ignore[arg-type]
+    """The rule in this precision; made once."""
+    key = (build, size, dtype, device)
+    held = _QUADRATURES.get(key)
+    if held is None:
+        rule = build(size)
+        nodes, mean_weights, spread = (part.to(dtype=dtype, device=device) for part in rule[:3])
+        held = rule._replace(nodes=nodes, mean_weights=mean_weights, covariance_weights=spread)
+        if not torch.compiler.is_compiling():
+            _QUADRATURES[key] = held
+    return held
 
 
 def taylor() -> Taylor:
@@ -200,8 +216,9 @@ def unscented(alpha: float = 1.0, beta: float = 0.0, kappa: float | None = None)
         eye = torch.eye(size, dtype=torch.float64) * reach**0.5
         nodes = torch.cat([torch.zeros(1, size, dtype=torch.float64), eye, -eye])
         mean_weights = torch.cat([torch.tensor([central], dtype=torch.float64), side])
-        spread = torch.cat([torch.tensor([central + 1 - alpha**2 + beta], dtype=torch.float64), side])
-        return Quadrature(nodes, mean_weights, spread, True)
+        central_spread = central + 1 - alpha**2 + beta
+        spread = torch.cat([torch.tensor([central_spread], dtype=torch.float64), side])
+        return Quadrature(nodes, mean_weights, spread, True, central_spread, central < 0)
 
     return SigmaPoints("unscented", build)
 
@@ -247,6 +264,8 @@ def law_space(law: object) -> Space:
 def predict(law: Law, belief: Gaussian, rule: Rule, u: Tensor | None, dt: Tensor | float | None) -> Gaussian:
     """Belief pushed through a transition law."""
     line = rule.linearize(law, belief, u, dt)
+    if line.mean.shape[-1] != belief.mean.shape[-1]:
+        raise ValueError(f"the transition law turns {belief.mean.shape[-1]} state numbers into {line.mean.shape[-1]}")
     factor = triangularize(cat_columns(line.slope, line.spread()))
     if line.negative is not None:
         factor = cholesky_downdate(factor, line.negative)
@@ -263,17 +282,28 @@ class Update(NamedTuple):
     nis: Tensor
 
 
-def update(
-    law: Law, prior: Gaussian, y: Tensor, rule: Rule, observed: Tensor | None = None, iterations: int = 1
-) -> Update:
-    """Belief given a measurement y (..., d_y); the components not ``observed`` (..., e_y) are marginalised exactly.
+Missing = Literal["none", "shared", "rows"]
 
-    With ``iterations`` > 1 the law is linearised again about the posterior: the iterated extended filter for `Taylor`,
-    iterated posterior linearisation for quadratures.
+
+def update(law: Law, prior: Gaussian, y: Tensor, rule: Rule, missing: Missing = "rows", iterations: int = 1) -> Update:
+    """Belief given a measurement y (..., d_y), whose NaN components are marginalised exactly.
+
+    Args:
+        law: measurement law.
+        prior: belief before the measurement.
+        y: broadcasts with the leading dims of the belief.
+        rule: how the law is linearised.
+        missing: what is known of the NaNs: "none" there are none, "shared" all rows miss the same components (a factor
+            that the rows share then stays shared), "rows" anything may be missing anywhere.
+        iterations: above 1 the law is linearised again about the posterior: the iterated extended filter for `Taylor`,
+            iterated posterior linearisation for quadratures.
 
     Source: Garcia-Fernandez, Svensson, Morelande, Särkkä, IEEE TSP 63 (2015), for the iterated form.
     """
     line = rule.linearize(law, prior, None, None)
+    if y.shape[-1] != line.mean.shape[-1]:
+        raise ValueError(f"the measurement has {y.shape[-1]} numbers, the observation law gives {line.mean.shape[-1]}")
+    observed = _observed(line.space, y, missing)
     result = _condition(prior, line, None, y, observed)
     for _ in range(iterations - 1):
         posterior = result.belief
@@ -281,9 +311,17 @@ def update(
         # slope S_posterior^-1 is the law's Jacobian; carry it back to the prior's own factor and mean.
         jacobian = torch.linalg.solve_triangular(posterior.factor(), line.slope, upper=False, left=False)
         line = line._replace(slope=jacobian @ prior.factor())
-        back = (jacobian @ posterior.space.local(posterior.mean, prior.mean).unsqueeze(-1)).squeeze(-1)
+        back = apply_factor(jacobian, posterior.space.local(posterior.mean, prior.mean))
         result = _condition(prior, line, back, y, observed)
     return result
+
+
+def _observed(space: Space, y: Tensor, missing: Missing) -> Tensor | None:
+    """Mask of the observed tangent components, (..., e), (e,) where all rows share it, None where nothing is missing."""
+    if missing == "none":
+        return None
+    observed = space.observed(y)
+    return observed.reshape(-1, observed.shape[-1])[0] if missing == "shared" else observed
 
 
 def _condition(

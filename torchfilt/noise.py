@@ -6,6 +6,10 @@ import torch
 from torch import Tensor
 
 _MASK = (1 << 64) - 1
+_WORD = (1 << 32) - 1
+
+STREAMS = 16
+"""Purposes a step can tell apart, numbered from 0."""
 
 
 def _mix(value: int) -> int:
@@ -14,6 +18,19 @@ def _mix(value: int) -> int:
     value = ((value ^ (value >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
     value = ((value ^ (value >> 27)) * 0x94D049BB133111EB) & _MASK
     return value ^ (value >> 31)
+
+
+def _permute(word: int, key: int) -> int:
+    """One of many shuffles of the 32-bit numbers, chosen by a 64-bit key: no two words meet.
+
+    Source: the finaliser of MurmurHash3 (Appleby, 2011), a chain of invertible steps.
+    """
+    for part in (key & _WORD, key >> 32):
+        word ^= part
+        word = ((word ^ (word >> 16)) * 0x85EBCA6B) & _WORD
+        word = ((word ^ (word >> 13)) * 0xC2B2AE35) & _WORD
+        word ^= word >> 16
+    return word
 
 
 class NoiseSource(NamedTuple):
@@ -27,8 +44,22 @@ class NoiseSource(NamedTuple):
 
     def generator(self, step: int, stream: int, device: torch.device) -> torch.Generator:
         """A fresh generator for this step and purpose; the global generator is never touched."""
-        key = _mix(_mix(_mix(self.seed & _MASK) ^ (step & _MASK)) ^ stream)
-        return torch.Generator(device).manual_seed(key >> 1)
+        return torch.Generator(device).manual_seed(self.seed_of(step, stream))
+
+    def seed_of(self, step: int, stream: int) -> int:
+        """Seed for a sampler that draws by itself, in [0, 2^63).
+
+        The generator of the CPU reads the low 32 bits only: drawn at random, two of 80,000 would be equal more often than
+        not. Here all steps below 2^28 and streams of one seed differ in them.
+
+        Raises:
+            ValueError: stream outside [0, 16).
+        """
+        if not 0 <= stream < STREAMS:
+            raise ValueError(f"stream must be in [0, {STREAMS}), got {stream}")
+        key = _mix(self.seed & _MASK)
+        low = _permute((step * STREAMS + stream) & _WORD, _mix(key))
+        return (_mix(_mix(key ^ (step & _MASK)) ^ stream) >> 33) << 32 | low
 
     def normal(self, shape: tuple[int, ...], step: int, stream: int, like: Tensor) -> Tensor:
         """Standard normals of ``shape`` (*batch, n, d), laid out component by component in memory."""

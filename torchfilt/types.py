@@ -11,7 +11,7 @@ B = TypeVar("B", Gaussian, Particles)
 
 
 class FilterState(NamedTuple, Generic[B]):
-    """The belief with the position in the noise sequence: all that streaming, branching and resuming need."""
+    """The belief with its place in the noise sequence: all that streaming, branching and resuming need."""
 
     belief: B
     step: int
@@ -19,10 +19,10 @@ class FilterState(NamedTuple, Generic[B]):
 
 
 class StepInfo(NamedTuple):
-    """What one step reports; entries a filter does not have are None.
+    """What one step reports; entries that a filter does not have are None.
 
-    log_likelihood, ok, nis, ess, acceptance_rate: (*batch). innovation (*batch, e_y), its factor
-    (*batch, e_y, e_y); ancestors (*batch, n).
+    log_likelihood, ok, nis, ess, acceptance_rate: (*batch). innovation (*batch, e_y) and its factor
+    (*batch, e_y, e_y), or (e_y, e_y) where all rows share it; ancestors (*batch, n). A history stacks them along time.
     """
 
     log_likelihood: Tensor
@@ -33,6 +33,21 @@ class StepInfo(NamedTuple):
     ess: Tensor | None = None
     ancestors: Tensor | None = None
     acceptance_rate: Tensor | None = None
+
+
+class StepNoise(NamedTuple):
+    """Random numbers of one step, drawn outside so that the step itself is a pure function.
+
+    proposal (*batch, n, e) standard normals or None; resampling (*batch, k) uniforms; redraw (*batch, n, e) or None;
+    move_normal (moves, *batch, n, e) and move_uniform (moves, *batch, n), or None; seed: for laws that draw by themselves.
+    """
+
+    proposal: Tensor | None
+    resampling: Tensor
+    redraw: Tensor | None = None
+    move_normal: Tensor | None = None
+    move_uniform: Tensor | None = None
+    seed: int = 0
 
 
 class FilterError(ArithmeticError):

@@ -1,0 +1,129 @@
+"""Gaussian filters: one square-root recursion, one moment rule; the named methods differ by the rule."""
+
+import torch
+from torch import Tensor
+
+from torchfilt.gaussian import Gaussian
+from torchfilt.model import StateSpaceModel
+from torchfilt.moments import (
+    Missing,
+    Rule,
+    Update,
+    cubature,
+    gauss_hermite,
+    predict,
+    taylor,
+    unscented,
+    update,
+)
+from torchfilt.run import Filter, Step
+from torchfilt.types import FilterState, StepInfo, StepNoise
+
+
+class GaussianFilter(Filter[Gaussian]):
+    """Square-root recursion of a Gaussian belief.
+
+    A covariance that no row's data, control or time step touches is carried once for the whole batch: with linear laws
+    and measurements whose rows miss the same components, thousands of series cost one covariance recursion. Rows that
+    fail hold NaN from then on and never influence others.
+
+    Args:
+        model: the three laws; laws that are not Gaussian enter by their first two moments.
+        rule: how moments go through a law: `taylor()`, `unscented()`, `cubature()`, `gauss_hermite()`.
+        iterations: linearisations of the measurement law, each about the posterior of the one before.
+
+    Raises:
+        ValueError: iterations below 1.
+    """
+
+    def __init__(self, model: StateSpaceModel, rule: Rule, iterations: int = 1) -> None:
+        super().__init__(model)
+        if iterations < 1:
+            raise ValueError(f"iterations must be at least 1, got {iterations}")
+        self.rule, self.iterations = rule, iterations
+        self.evidence = "exact" if model.is_linear() else "linearized"
+
+    def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[Gaussian]:
+        """The prior's moments, the mean expanded to (*batch, d); ``seed`` is carried along unused."""
+        prior = self.model.prior()
+        mean = prior.mean.expand(*batch_shape, prior.mean.shape[-1])
+        return FilterState(Gaussian(mean, prior.factor(), prior.space), 0, seed)
+
+    def predict(self, belief: Gaussian, u: Tensor | None = None, dt: Step = None) -> Gaussian:
+        """Belief after the motion; arguments as in `advance`."""
+        return predict(self.model.moments("transition"), belief, self.rule, u, dt)
+
+    def update(self, belief: Gaussian, y: Tensor, missing: Missing = "rows") -> Update:
+        """Belief after a measurement y (*batch, m), with innovation and likelihood."""
+        return update(self.model.moments("observation"), belief, y, self.rule, missing, self.iterations)
+
+    def advance(
+        self,
+        belief: Gaussian,
+        y: Tensor,
+        u: Tensor | None = None,
+        dt: Step = None,
+        noise: StepNoise | None = None,
+        missing: Missing = "rows",
+        predict: bool = True,
+    ) -> tuple[Gaussian, StepInfo]:
+        """See `Filter.advance`; noise is not used."""
+        if predict:
+            belief = self.predict(belief, u, dt)
+        result = self.update(belief, y, missing)
+        posterior = result.belief
+        # A factor made by a triangularisation cannot lose definiteness but by NaN; a failed downdate is NaN as well.
+        sound = torch.isfinite(posterior.scale_tril).flatten(-2).all(-1) & torch.isfinite(posterior.mean).all(-1)
+        ok = torch.isfinite(result.log_likelihood) & sound
+        info = StepInfo(result.log_likelihood, ok, result.innovation, result.innovation_scale_tril, result.nis)
+        return posterior, info
+
+
+def KalmanFilter(model: StateSpaceModel) -> GaussianFilter:
+    """Exact filter for linear-Gaussian models, square-root form.
+
+    Raises:
+        TypeError: a law that does not give its `linear_form`.
+
+    Source: Kailath, Sayed, Hassibi, Linear Estimation (2000), chapter 12.
+    """
+    for name in ("transition", "observation"):
+        law = getattr(model, name)
+        if not hasattr(law, "linear_form"):
+            raise TypeError(
+                f"KalmanFilter needs linear laws; {name} is a {type(law).__name__} without linear_form. "
+                "Take ExtendedKalmanFilter or UnscentedKalmanFilter"
+            )
+    return GaussianFilter(model, taylor())
+
+
+def ExtendedKalmanFilter(model: StateSpaceModel, iterations: int = 1) -> GaussianFilter:
+    """First-order linearisation with exact derivatives; ``iterations`` > 1 is the iterated form.
+
+    Source: Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE TAC 38 (1993).
+    """
+    return GaussianFilter(model, taylor(), iterations)
+
+
+def UnscentedKalmanFilter(
+    model: StateSpaceModel,
+    alpha: float = 1.0,
+    beta: float = 0.0,
+    kappa: float | None = None,
+    iterations: int = 1,
+) -> GaussianFilter:
+    """Statistical linearisation by 2e + 1 sigma points; parameters as in `torchfilt.moments.unscented`.
+
+    Source: Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proc. IEEE 92 (2004).
+    """
+    return GaussianFilter(model, unscented(alpha, beta, kappa), iterations)
+
+
+def CubatureKalmanFilter(model: StateSpaceModel, iterations: int = 1) -> GaussianFilter:
+    """Third-degree spherical-radial cubature, 2e points. Source: Arasaratnam and Haykin, IEEE TAC 54 (2009)."""
+    return GaussianFilter(model, cubature(), iterations)
+
+
+def GaussHermiteKalmanFilter(model: StateSpaceModel, order: int = 3, iterations: int = 1) -> GaussianFilter:
+    """Product Gauss-Hermite quadrature, order ** e points. Source: Ito and Xiong, IEEE TAC 45 (2000)."""
+    return GaussianFilter(model, gauss_hermite(order), iterations)

@@ -1,0 +1,241 @@
+"""What a filter did over a whole series."""
+
+import io
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torchfilt.gaussian import Gaussian
+from torchfilt.particles import Particles
+from torchfilt.spaces import EUCLIDEAN, Angle, Euclidean, Product, Space, UnitQuaternion
+from torchfilt.storage import IntegrityError, read_verified, write_verified
+from torchfilt.types import FilterState, StepInfo
+
+Record = Literal["mean", "moments", "beliefs"]
+FILE_KIND = "torchfilt history"
+
+
+@dataclass(frozen=True)
+class History:
+    """Stacked beliefs and reports over t steps.
+
+    mean: (t, *batch, d). diagnostics: `StepInfo` with entries (t, *batch, ...). final: state to go on from.
+    beliefs: stacked `Gaussian` or `Particles`, None where they were not recorded. evidence: what the log-likelihood is,
+    see `torchfilt.run.Filter`.
+    """
+
+    mean: Tensor
+    diagnostics: StepInfo
+    final: FilterState[Any]
+    evidence: str
+    space: Space = EUCLIDEAN
+    beliefs: Gaussian | Particles | None = None
+    cloud_covariance: Tensor | None = None
+
+    @property
+    def covariance(self) -> Tensor:
+        """Covariance of the error (t, *batch, e, e).
+
+        Raises:
+            ValueError: the run recorded means only.
+        """
+        if self.cloud_covariance is not None:
+            return self.cloud_covariance
+        if isinstance(self.beliefs, Gaussian):
+            return self.beliefs.covariance
+        raise ValueError("no covariance: the filter ran with record='mean'")
+
+    @property
+    def log_likelihood(self) -> Tensor:
+        """Sum over the steps, (*batch)."""
+        return self.diagnostics.log_likelihood.sum(0)
+
+    def to_numpy(self) -> dict[str, Any]:
+        """Arrays by name: mean, covariance (where recorded), log_likelihood (per step) and the diagnostics."""
+        arrays = {"mean": self.mean}
+        if self.beliefs is not None or self.cloud_covariance is not None:
+            arrays["covariance"] = self.covariance
+        arrays |= {name: value for name, value in self.diagnostics._asdict().items() if value is not None}
+        return {name: value.detach().cpu().numpy() for name, value in arrays.items()}
+
+    def to_xarray(self) -> Any:
+        """The same as an `xarray.Dataset` with dims time, batch_0, ..., state (xarray is loaded here)."""
+        import xarray
+
+        batch = [f"batch_{k}" for k in range(self.mean.dim() - 2)]
+        tails = {
+            "mean": ["state"],
+            "covariance": ["error", "error_2"],
+            "innovation": ["measurement"],
+            "innovation_scale_tril": ["measurement", "measurement_2"],
+            "ancestors": ["particle"],
+        }
+        variables = {}
+        for name, array in self.to_numpy().items():
+            tail = tails.get(name, [])
+            shared = array.ndim == 1 + len(tail)
+            variables[name] = (["time", *([] if shared else batch), *tail], array)
+        return xarray.Dataset(variables, attrs={"evidence": self.evidence})
+
+    def save(self, path: str | Path) -> None:
+        """Write an NPZ (no pickle) with its SHA-256 manifest, atomically; the final state is in it."""
+        import numpy as np
+
+        final = self.final.belief
+        kind = "gaussian" if isinstance(final, Gaussian) else "particles"
+        head = {
+            "belief": kind,
+            "evidence": self.evidence,
+            "space": space_to_plain(self.space),
+            "step": self.final.step,
+            "seed": self.final.seed,
+            "is_diagonal": bool(getattr(final, "is_diagonal", False)),
+        }
+        parts: dict[str, Tensor | None] = {"mean": self.mean, "covariance": self.cloud_covariance}
+        parts |= {f"info.{name}": value for name, value in self.diagnostics._asdict().items()}
+        for prefix, belief in (("final", final), ("beliefs", self.beliefs)):
+            if belief is not None:
+                named = belief._asdict()
+                parts |= {f"{prefix}.{name}": named[name] for name in named if isinstance(named[name], Tensor)}
+        arrays = {name: value.detach().cpu().numpy() for name, value in parts.items() if value is not None}
+        arrays["head"] = np.frombuffer(json.dumps(head, sort_keys=True).encode(), dtype=np.uint8)
+        stream = io.BytesIO()
+        np.savez(stream, **arrays)
+        write_verified(path, stream.getvalue(), FILE_KIND)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "History":
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: no such file.
+            IntegrityError: truncated, altered or foreign; names the file and the rule.
+        """
+        import numpy as np
+
+        data = read_verified(path, FILE_KIND)
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            head = json.loads(arrays.pop("head").tobytes())
+            tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
+            space = space_from_plain(head["space"])
+            final = _belief(tensors, "final", head, space)
+            recorded = {name for name in tensors if name.startswith("beliefs.")}
+            beliefs = _belief(tensors, "beliefs", head, space) if recorded else None
+            info = StepInfo(**{name: tensors.get(f"info.{name}") for name in StepInfo._fields})  # type: ignore[arg-type]
+            return cls(
+                tensors["mean"],
+                info,
+                FilterState(final, int(head["step"]), int(head["seed"])),
+                str(head["evidence"]),
+                space,
+                beliefs,
+                tensors.get("covariance"),
+            )
+        except (KeyError, ValueError, TypeError, OSError) as error:
+            raise IntegrityError(f"{path}: not a history of this version ({error})") from None
+
+
+_SPACES = {"Euclidean": Euclidean, "Angle": Angle, "UnitQuaternion": UnitQuaternion}
+
+
+def space_to_plain(space: Space) -> Any:
+    """A space as JSON-ready values.
+
+    Raises:
+        TypeError: a space that is not one of the library's own.
+    """
+    if isinstance(space, Product):
+        return ["Product", [space_to_plain(part) for part in space.spaces]]
+    name = type(space).__name__
+    if _SPACES.get(name) is not type(space):
+        raise TypeError(f"only the library's own spaces can be saved, got {space!r}")
+    return [name, dict(vars(space))]
+
+
+def space_from_plain(value: Any) -> Space:
+    """The inverse of `space_to_plain`."""
+    name, content = value
+    if name == "Product":
+        return Product(*(space_from_plain(part) for part in content))
+    space: Space = _SPACES[name](**content)
+    return space
+
+
+def _belief(tensors: dict[str, Tensor], prefix: str, head: dict[str, Any], space: Space) -> Any:
+    own = {name.removeprefix(f"{prefix}."): value for name, value in tensors.items() if name.startswith(f"{prefix}.")}
+    if head["belief"] == "gaussian":
+        return Gaussian(own["mean"], own["scale_tril"], space, bool(head["is_diagonal"]))
+    return Particles(own["x"], own["log_weights"], own.get("scale_tril"), space)
+
+
+@dataclass
+class Recorder:
+    """Collects beliefs and reports step by step, keeping as much as ``record`` says."""
+
+    record: Record
+    evidence: str
+    means: list[Tensor] = field(default_factory=list)
+    covariances: list[Tensor] = field(default_factory=list)
+    beliefs: list[Gaussian | Particles] = field(default_factory=list)
+    infos: list[StepInfo] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.record not in ("mean", "moments", "beliefs"):
+            raise ValueError(f"record must be 'mean', 'moments' or 'beliefs', got {self.record!r}")
+
+    def add(self, belief: Gaussian | Particles, info: StepInfo) -> None:
+        """Take in one step."""
+        if self.record != "beliefs":
+            info = info._replace(ancestors=None)
+        if self.record == "mean":
+            info = info._replace(innovation=None, innovation_scale_tril=None)
+        self.infos.append(info)
+        if isinstance(belief, Gaussian):
+            self.means.append(belief.mean)
+            if self.record != "mean":
+                self.beliefs.append(belief)
+            return
+        if self.record == "mean":
+            self.means.append(belief.mean)
+            return
+        mean, covariance = belief.moments()
+        self.means.append(mean)
+        self.covariances.append(covariance)
+        if self.record == "beliefs":
+            self.beliefs.append(belief)
+
+    def finish(self, final: FilterState[Any]) -> History:
+        """The history of all steps taken in."""
+        mean = torch.stack(self.means)
+        covariance = torch.stack(self.covariances) if self.covariances else None
+        info = StepInfo(*(_stack([step[k] for step in self.infos]) for k in range(len(StepInfo._fields))))  # type: ignore[arg-type]
+        beliefs: Gaussian | Particles | None = None
+        if self.beliefs and isinstance(self.beliefs[0], Gaussian):
+            factor = _stack([belief.scale_tril for belief in self.beliefs])
+            assert factor is not None
+            # Room for batch dims where all rows share one factor a step.
+            missing = mean.dim() + 1 - factor.dim()
+            factor = factor.reshape(len(factor), *[1] * missing, *factor.shape[1:])
+            beliefs = Gaussian(mean, factor, self.beliefs[0].space)
+        elif self.beliefs:
+            rows = [_stack([belief[k] for belief in self.beliefs]) for k in range(3)]  # type: ignore[arg-type]
+            beliefs = Particles(rows[0], rows[1], rows[2], self.beliefs[0].space)  # type: ignore[arg-type]
+        return History(mean, info, final, self.evidence, final.belief.space, beliefs, covariance)
+
+
+def _stack(values: list[Tensor | None]) -> Tensor | None:
+    """Along time; steps whose rows share a value are widened where other steps have one a row."""
+    present = [value for value in values if value is not None]
+    if len(present) < len(values):
+        return None
+    shapes = {value.shape for value in present}
+    if len(shapes) > 1:
+        widest = torch.broadcast_shapes(*shapes)
+        present = [value.expand(widest) for value in present]
+    return torch.stack(present)

@@ -1,0 +1,253 @@
+"""How particles reach the next step: from the motion alone, or each by its own Gaussian filter."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfilt.gaussian import Gaussian
+from torchfilt.linalg import apply_factor, triangularize
+from torchfilt.model import Conditional, StateSpaceModel, as_gaussian, log_prob, sample
+from torchfilt.moments import Missing, Rule, predict, update
+from torchfilt.particles import Particles, uniform_log_weights
+from torchfilt.spaces import EUCLIDEAN, Space, weighted_sum
+from torchfilt.types import StepNoise
+
+Step = Tensor | float | None
+Evidence = Literal["unbiased", "linearized", "approximate"]
+Redraw = Literal["never", "resample", "always"]
+
+
+class Proposed(NamedTuple):
+    """Particles after the measurement, x (*batch, n, d), with factors or None, and what their log-weights gain."""
+
+    x: Tensor
+    scale_tril: Tensor | None
+    log_weight: Tensor
+    space: Space
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Particles move by the transition law; the measurement only weights them.
+
+    Source: Gordon, Salmond, Smith, Novel approach to nonlinear/non-Gaussian Bayesian state estimation (1993).
+    """
+
+    evidence: Evidence = "unbiased"
+    draws_at_once: bool = True
+    needs_redraw_noise: bool = False
+    leaves_points: bool = True
+
+    def start(self, initial: Conditional, draws: Tensor, noise: Tensor) -> Particles:
+        """Particles for draws (*batch, n, d) of the initial law."""
+        return _equal_weights(draws, None, _space_of(initial))
+
+    def refresh(self, particles: Particles, noise: Tensor | None, resampled: Tensor | None) -> Particles:
+        """Points have no uncertainty of their own to share."""
+        return particles
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        particles: Particles,
+        y: Tensor,
+        u: Tensor | None,
+        dt: Step,
+        noise: StepNoise,
+        missing: Missing,
+        move: bool,
+    ) -> Proposed:
+        """Shapes as in `Local`."""
+        x, space = particles.x, particles.space
+        if move:
+            assert noise.proposal is not None
+            law = model.conditional("transition", x, u, dt)
+            x, space = sample(law, noise.proposal, noise.seed), _space_of(law)
+        return Proposed(x, None, log_prob(model.conditional("observation", x), y, missing), space)
+
+
+@dataclass(frozen=True)
+class Local:
+    """Each particle is a Gaussian that is predicted and updated by a moment rule of its own.
+
+    Between two measurements uncertainty can be shared anew between the particles' spread and their own covariances:
+
+    * ``split`` s: draw x ~ N(x_i, (1 - s) P_i) and keep s P_i, which leaves the mixture as it is. 0 makes points.
+      None is the literature's literal form: draw from all of P_i and keep all of P_i, counting it twice.
+    * ``pooled``: the fraction s is taken of the whole cloud's covariance V, not of P_i: draws are matched to the cloud's
+      mean m and covariance V, shrunk to m + sqrt(1 - s) (x - m), and every particle gets s V. Mean and covariance of the
+      cloud stay as they are; its shape becomes smoother, so the evidence is approximate.
+    * ``redraw``: "never" again after the start, "resample" in rows that were just resampled, or "always".
+
+    Weights: "marginal" is each particle's innovation likelihood N(y; y_i, S_i), with the draw put off to the next step;
+    "joint" draws x at once from N(x_i+, P_i+) and weights by p(y|x) N(x; x_i-, P_i-) / N(x; x_i+, P_i+). With split 0
+    particles are points, N(x_i-, P_i-) is the transition law itself, and joint weights are proper importance weights. On
+    linear-Gaussian models both are the same number.
+
+    Args:
+        rule: moment rule.
+        redraw, split, pooled, weights: see above.
+
+    Raises:
+        ValueError: split outside [0, 1], combinations that have no meaning.
+
+    Sources: van der Merwe, Doucet, de Freitas, Wan, The unscented particle filter, NIPS 13 (2000); Liu and West, Combined
+    parameter and state estimation (2001), for the pooled kernel.
+    """
+
+    rule: Rule
+    redraw: Redraw = "never"
+    split: float | None = 0.5
+    pooled: bool = False
+    weights: Literal["marginal", "joint"] = "marginal"
+
+    def __post_init__(self) -> None:
+        if self.redraw not in ("never", "resample", "always"):
+            raise ValueError(f"redraw must be 'never', 'resample' or 'always', got {self.redraw!r}")
+        if self.weights not in ("marginal", "joint"):
+            raise ValueError(f"weights must be 'marginal' or 'joint', got {self.weights!r}")
+        if self.split is not None and not 0 <= self.split <= 1:
+            raise ValueError(f"split must be in [0, 1] or None, got {self.split}")
+        if self.weights == "joint" and (self.split not in (0.0, None) or self.pooled):
+            raise ValueError(
+                "joint weights draw from the whole of P_i: they need split=0 (points) or split=None (literal)"
+            )
+        if self.weights == "joint" and self.redraw != "always":
+            raise ValueError(f"joint weights draw at every step: they need redraw='always', got {self.redraw!r}")
+        if self.pooled and (self.split is None or not 0 < self.split < 1):
+            raise ValueError(f"a pooled redraw needs 0 < split < 1, got {self.split}")
+
+    @property
+    def evidence(self) -> Evidence:
+        """What the log-likelihood is worth, see `torchfilt.run.Filter`."""
+        if self.pooled or (self.split is None and self.redraw != "never"):
+            return "approximate"
+        return "unbiased" if self.weights == "joint" else "linearized"
+
+    @property
+    def draws_at_once(self) -> bool:
+        """Whether the step itself draws."""
+        return self.weights == "joint"
+
+    @property
+    def needs_redraw_noise(self) -> bool:
+        """Whether `refresh` draws."""
+        return self.weights == "marginal" and self.redraw != "never"
+
+    @property
+    def leaves_points(self) -> bool:
+        """Whether particles are points after a step."""
+        return self.weights == "joint" and self.split is not None
+
+    def start(self, initial: Conditional, draws: Tensor, noise: Tensor) -> Particles:
+        """The initial law's moments as n equal Gaussians, then split between spread and local covariance."""
+        prior = as_gaussian(initial)
+        mean = prior.mean.unsqueeze(-2).expand_as(draws)
+        factor = prior.factor().unsqueeze(-3).expand(*draws.shape[:-2], 1, -1, -1)
+        return self._share(_equal_weights(mean, factor, prior.space), noise)
+
+    def refresh(self, particles: Particles, noise: Tensor | None, resampled: Tensor | None) -> Particles:
+        """Share uncertainty anew, by the redraw policy.
+
+        Args:
+            particles: after resampling.
+            noise: (*batch, n, e) standard normals.
+            resampled: (*batch), which rows were resampled; None for all.
+        """
+        if particles.scale_tril is None or not self.needs_redraw_noise:
+            return particles
+        assert noise is not None
+        fresh = self._share(particles, noise)
+        if self.redraw == "always" or resampled is None:
+            return fresh
+        chosen = resampled.unsqueeze(-1).unsqueeze(-1)
+        kept = fresh.scale_tril if fresh.scale_tril is not None else torch.zeros_like(particles.scale_tril)
+        factor = torch.where(chosen.unsqueeze(-1), kept, particles.scale_tril)
+        return fresh._replace(x=torch.where(chosen, fresh.x, particles.x), scale_tril=factor)
+
+    def _share(self, particles: Particles, noise: Tensor) -> Particles:
+        if self.pooled:
+            return self._pool(particles, noise)
+        factor, space = particles.scale_tril, particles.space
+        assert factor is not None
+        drawn = 1.0 if self.split is None else (1 - self.split) ** 0.5
+        x = particles.x if drawn == 0 else space.retract(particles.x, drawn * apply_factor(factor, noise))
+        if self.split == 0:
+            return particles._replace(x=x, scale_tril=None)
+        kept = 1.0 if self.split is None else self.split**0.5
+        return particles._replace(x=x, scale_tril=factor * kept)
+
+    def _pool(self, particles: Particles, noise: Tensor) -> Particles:
+        assert self.split is not None and particles.scale_tril is not None
+        space, weights = particles.space, particles.weights
+        mean = space.mean(particles.x, weights)
+        apart = space.local(mean.unsqueeze(-2), particles.x)
+        # Cloud's covariance by one triangularisation of its columns, so that nothing is squared.
+        root = weights.sqrt().unsqueeze(-1)
+        own = particles.scale_tril
+        own = own if own.shape[-3] == 1 else own * root.unsqueeze(-1)
+        columns = torch.cat([(apart * root).mT, own.movedim(-3, -2).flatten(-2)], -1)
+        whole = triangularize(columns)
+        drawn = apart + apply_factor(particles.scale_tril, noise)
+        drawn = drawn - weighted_sum(drawn, weights).unsqueeze(-2)
+        found = triangularize((drawn * root).mT)
+        # whole found^-1 takes the draws' covariance to the cloud's.
+        matched = whole @ torch.linalg.solve_triangular(found, drawn.mT, upper=False)
+        x = space.retract(mean.unsqueeze(-2), ((1 - self.split) ** 0.5 * matched).mT)
+        return particles._replace(x=x, scale_tril=(self.split**0.5 * whole).unsqueeze(-3))
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        particles: Particles,
+        y: Tensor,
+        u: Tensor | None,
+        dt: Step,
+        noise: StepNoise,
+        missing: Missing,
+        move: bool,
+    ) -> Proposed:
+        """One predicted and updated Gaussian a particle.
+
+        Args:
+            model: the three laws.
+            particles: x (*batch, n, d).
+            y: (*batch, 1, m).
+            u, dt: with room for the particle axis.
+            noise: proposal (*batch, n, e) for joint weights.
+            missing: pattern of NaNs in y.
+            move: False leaves the motion out.
+        """
+        if not move and particles.scale_tril is None:
+            # Points that stand still have no law to be drawn from again: the measurement weights them.
+            return Prior()(model, particles, y, u, dt, noise, missing, move)
+        predicted = self._predict(model, particles, u, dt, move)
+        result = update(model.moments("observation"), predicted, y, self.rule, missing)
+        posterior = result.belief
+        if self.weights == "marginal":
+            return Proposed(posterior.mean, posterior.scale_tril, result.log_likelihood, posterior.space)
+        assert noise.proposal is not None
+        x = posterior.sample(noise.proposal)
+        ratio = predicted.log_prob(x) - posterior.log_prob(x)
+        log_weight = log_prob(model.conditional("observation", x), y, missing) + ratio
+        return Proposed(x, None if self.split == 0 else posterior.scale_tril, log_weight, posterior.space)
+
+    def _predict(
+        self, model: StateSpaceModel, particles: Particles, u: Tensor | None, dt: Step, move: bool
+    ) -> Gaussian:
+        law = model.moments("transition")
+        if particles.scale_tril is not None:
+            bank = Gaussian(particles.x, particles.scale_tril, particles.space)
+            return predict(law, bank, self.rule, u, dt) if move else bank
+        step = law(particles.x, u, dt)
+        return step._replace(scale_tril=step.factor(), is_diagonal=False)
+
+
+def _equal_weights(x: Tensor, factor: Tensor | None, space: Space) -> Particles:
+    return Particles(x, uniform_log_weights(x.shape[:-1], x), factor, space)
+
+
+def _space_of(law: Conditional) -> Space:
+    return law.space if isinstance(law, Gaussian) else EUCLIDEAN

@@ -1,0 +1,249 @@
+"""The one driver of every filter: the same step offline and in a stream."""
+
+from collections.abc import Iterator
+from typing import Any, Generic, Literal, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from torchfilt.gaussian import Gaussian
+from torchfilt.history import History, Record, Recorder
+from torchfilt.model import StateSpaceModel
+from torchfilt.moments import Missing
+from torchfilt.particles import Particles
+from torchfilt.types import FilterError, FilterState, StepInfo, StepNoise
+
+B = TypeVar("B", Gaussian, Particles)
+Evidence = Literal["exact", "unbiased", "linearized", "approximate"]
+Step = Tensor | float | None
+
+
+class Filter(nn.Module, Generic[B]):
+    """A filter is `init` and `advance`; streaming, whole series, checks and records are the same for all.
+
+    Index convention: the prior is the state before the first measurement; each step moves it over dt and then takes the
+    measurement in. ``dt = 0`` means no motion; where laws know no dt, ``predict_first=False`` says it for the first step.
+
+    Attributes:
+        model: the three laws.
+        evidence: what log_likelihood is: "exact"; "unbiased" (its exponential is, over seeds); "linearized" (exact but
+            for the linearisation of the laws); "approximate" (shrinkage or the literature's literal weights bias it).
+    """
+
+    evidence: Evidence = "exact"
+
+    def __init__(self, model: StateSpaceModel) -> None:
+        super().__init__()
+        if not isinstance(model, StateSpaceModel):
+            raise TypeError(f"model must be a StateSpaceModel, got {type(model).__name__}")
+        self.model = model
+
+    def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[B]:
+        """The prior for ``batch_shape`` independent runs."""
+        raise NotImplementedError
+
+    def draw(self, belief: B, step: int, seed: int) -> StepNoise | None:
+        """Random numbers of a step; None for filters without randomness."""
+        return None
+
+    def advance(
+        self,
+        belief: B,
+        y: Tensor,
+        u: Tensor | None = None,
+        dt: Step = None,
+        noise: StepNoise | None = None,
+        missing: Missing = "rows",
+        predict: bool = True,
+    ) -> tuple[B, StepInfo]:
+        """One step as a pure function of tensors: what `torch.compile`, `torch.func` and both drivers call.
+
+        Args:
+            belief: of `init` or of the step before.
+            y: (*batch, m); NaN means not measured.
+            u: (*batch, k), (k,) or None.
+            dt: number, (*batch, 1) or None, s.
+            noise: of `draw`.
+            missing: what is known of the NaNs in y, see `torchfilt.moments.update`; "rows" is always right.
+            predict: False leaves the motion out.
+
+        Returns:
+            Belief after the measurement, and the report.
+        """
+        raise NotImplementedError
+
+    def step(
+        self,
+        state: FilterState[B],
+        y: Tensor,
+        u: Tensor | None = None,
+        dt: Step = None,
+        *,
+        predict_first: bool = True,
+        throw: bool = True,
+    ) -> tuple[FilterState[B], StepInfo]:
+        """One measurement of a stream; the same bits as `forward` over the whole series.
+
+        Args:
+            state: of `init` or of the step before.
+            y: (*batch, m); NaN means not measured.
+            u: control (*batch, k) or (k,).
+            dt: number or (*batch), s.
+            predict_first: False where the measurement belongs to the time of the prior itself.
+            throw: raise on failed rows; False leaves it to ``info.ok``.
+
+        Returns:
+            State after the measurement, and the report.
+
+        Raises:
+            FilterError: a row failed (``throw``). TypeError, ValueError: dtype, shape, Inf in y.
+        """
+        _check_measurements(y, state.belief, "y")
+        if isinstance(dt, Tensor):
+            dt = dt.unsqueeze(-1)
+        missing = _missing_of(y)
+        noise = self.draw(state.belief, state.step, state.seed)
+        belief, info = self.advance(state.belief, y, u, dt, noise, missing, predict_first)
+        if throw and not bool(info.ok.all()):
+            raise FilterError(_failure(info.ok, state.step, y))
+        return FilterState(belief, state.step + 1, state.seed), info
+
+    def forward(
+        self,
+        measurements: Tensor,
+        controls: Tensor | None = None,
+        dt: Step = None,
+        *,
+        predict_first: bool = True,
+        state: FilterState[B] | None = None,
+        seed: int = 0,
+        record: Record = "moments",
+        throw: bool = True,
+        progress: bool = False,
+    ) -> History:
+        """Filter whole series.
+
+        Args:
+            measurements: (t, *batch, m); NaN means not measured.
+            controls: (t, k) shared by the batch, or (t, *batch, k).
+            dt: time steps, s: a number, (t,) or (t, *batch).
+            predict_first: False where the first measurement belongs to the time of the prior itself.
+            state: where to go on from (``history.final``); default the prior.
+            seed: of the random numbers; the same seed gives the same bits, whatever the thread count.
+            record: "mean", "moments" (mean and covariance) or "beliefs" (everything that is carried).
+            throw: raise on failed rows; False leaves it to ``history.diagnostics.ok``.
+            progress: show a bar on a terminal.
+
+        Returns:
+            History over the t steps.
+
+        Raises:
+            FilterError: a row failed; the message names the first step, the rows and the measurement.
+            TypeError, ValueError: dtype, shape, values that are not finite; the first bad entry is named.
+        """
+        if measurements.dim() < 2 or len(measurements) == 0:
+            raise ValueError(f"measurements must be (t, *batch, m) with t >= 1, got {tuple(measurements.shape)}")
+        if state is None:
+            state = self.init(tuple(measurements.shape[1:-1]), seed)
+        _check_measurements(measurements, state.belief, "measurements")
+        _check_controls(controls, measurements)
+        steps = _time_steps(dt, measurements)
+        missing = _missing_by_step(measurements)
+        recorder = Recorder(record, self.evidence)
+        belief, start = state.belief, state.step
+        for k in _counted(len(measurements), progress):
+            noise = self.draw(belief, start + k, state.seed)
+            u = None if controls is None else controls[k]
+            predict = predict_first or k > 0
+            belief, info = self.advance(belief, measurements[k], u, steps[k], noise, missing[k], predict)
+            recorder.add(belief, info)
+        history = recorder.finish(FilterState(belief, start + len(measurements), state.seed))
+        if throw and not bool(history.diagnostics.ok.all()):
+            first = (
+                int((~history.diagnostics.ok).flatten(1).any(1).nonzero()[0])
+                if measurements.dim() > 2
+                else int((~history.diagnostics.ok).nonzero()[0])
+            )
+            raise FilterError(_failure(history.diagnostics.ok[first], start + first, measurements[first]))
+        return history
+
+
+def _check_measurements(y: Tensor, belief: Gaussian | Particles, name: str) -> None:
+    """Dtype as the model's, no infinities."""
+    like = belief.mean if isinstance(belief, Gaussian) else belief.x
+    if y.dtype != like.dtype:
+        raise TypeError(f"{name} must have the model's dtype {like.dtype}, got {y.dtype}")
+    infinite = torch.isinf(y.detach())
+    if infinite.any():
+        where = tuple(infinite.nonzero()[0].tolist())
+        raise ValueError(f"{name} must be finite or NaN (not measured), entry {where} is {y.detach()[where].item()}")
+
+
+def _check_controls(controls: Tensor | None, measurements: Tensor) -> None:
+    if controls is None:
+        return
+    if controls.dim() < 2 or len(controls) != len(measurements):
+        raise ValueError(
+            f"controls must be (t, k) or (t, *batch, k) with t = {len(measurements)}, got {tuple(controls.shape)}"
+        )
+    bad = ~torch.isfinite(controls.detach())
+    if bad.any():
+        where = tuple(bad.nonzero()[0].tolist())
+        raise ValueError(f"controls must be finite, entry {where} is {controls.detach()[where].item()}")
+
+
+def _time_steps(dt: Step, measurements: Tensor) -> list[Any]:
+    """One entry a step: number, (*batch, 1) or None."""
+    count = len(measurements)
+    if dt is None or not isinstance(dt, Tensor):
+        if dt is not None and not 0 <= dt < float("inf"):
+            raise ValueError(f"dt must be finite and >= 0, got {dt}")
+        return [dt] * count
+    if dt.shape not in ((count,), measurements.shape[:-1]):
+        raise ValueError(f"dt must be a number, ({count},) or {tuple(measurements.shape[:-1])}, got {tuple(dt.shape)}")
+    bad = ~(torch.isfinite(dt.detach()) & (dt.detach() >= 0))
+    if bad.any():
+        where = tuple(bad.nonzero()[0].tolist())
+        raise ValueError(f"dt must be finite and >= 0, entry {where} is {dt.detach()[where].item()}")
+    if dt.dim() == 1 and not dt.requires_grad:
+        return list(dt.tolist())  # plain numbers let laws use what they hold for their usual step
+    return list(dt.unsqueeze(-1))
+
+
+def _missing_of(y: Tensor) -> Missing:
+    """Pattern of one step."""
+    absent = torch.isnan(y)
+    if not bool(absent.any()):
+        return "none"
+    rows = absent.reshape(-1, absent.shape[-1])
+    return "shared" if bool((rows == rows[0]).all()) else "rows"
+
+
+def _missing_by_step(measurements: Tensor) -> list[Missing]:
+    """Pattern of each step, looked up once for the whole series."""
+    absent = torch.isnan(measurements)
+    if not bool(absent.any()):
+        return ["none"] * len(measurements)
+    rows = absent.reshape(len(absent), -1, absent.shape[-1])
+    some, equal = rows.flatten(1).any(1).tolist(), (rows == rows[:, :1]).flatten(1).all(1).tolist()
+    return ["none" if not a else "shared" if b else "rows" for a, b in zip(some, equal, strict=True)]
+
+
+def _failure(ok: Tensor, step: int, y: Tensor) -> str:
+    rows = (~ok).nonzero().tolist() if ok.dim() else [[]]
+    shown = [tuple(row) for row in rows[:5]]
+    values = [y[row].tolist() for row in shown] if y.dim() > 1 else [y.tolist()]
+    more = "" if len(rows) <= 5 else f" and {len(rows) - 5} more"
+    where = f"rows {shown}{more}" if ok.dim() else "the only row"
+    return (
+        f"step {step}, {where}: belief and likelihood must be finite and the covariance positive definite after the "
+        f"measurement; it was {values}. With throw=False such rows are marked in `ok` and the others go on"
+    )
+
+
+def _counted(count: int, progress: bool) -> Iterator[int]:
+    if not progress:
+        return iter(range(count))
+    from tqdm import tqdm
+
+    return iter(tqdm(range(count), unit="step", disable=None))
