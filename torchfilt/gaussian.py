@@ -39,7 +39,8 @@ class Gaussian(NamedTuple):
         """Covariance of the error, (..., e, e), expanded over the leading dims of the mean."""
         factor = self.factor()
         product = factor @ factor.mT
-        return product.expand(*self.mean.shape[:-1], *product.shape[-2:])
+        lead = torch.broadcast_shapes(self.mean.shape[:-1], product.shape[:-2])
+        return product.expand(*lead, *product.shape[-2:])
 
     @property
     def variance(self) -> Tensor:
@@ -54,7 +55,8 @@ class Gaussian(NamedTuple):
     def log_prob(self, x: Tensor, observed: Tensor | None = None) -> Tensor:
         """Log-density (per unit of tangent volume at the mean) of points x (..., d); returns (...).
 
-        ``observed`` (..., e) marks the components of the error to keep; the others are integrated out exactly.
+        ``observed`` (..., e) marks the components of the error to keep; the others are integrated out exactly. A
+        component marked as observed that is NaN in x gives NaN, as it does without ``observed``.
         """
         if observed is not None:
             return self._marginal_log_prob(x, observed)
@@ -64,8 +66,9 @@ class Gaussian(NamedTuple):
 
     def _marginal_log_prob(self, x: Tensor, observed: Tensor) -> Tensor:
         present = observed.to(self.mean.dtype)
-        filled = torch.where(torch.isnan(x), self.mean, x)
-        residual = torch.where(observed, self.space.local(self.mean, filled), 0)
+        filled = torch.where(torch.isnan(x), self.mean, x)  # NaN on the way would spoil the gradients
+        residual = self.space.local(self.mean, filled).masked_fill(~self.space.observed(x), torch.nan)
+        residual = torch.where(observed, residual, 0)
         if self.is_diagonal:
             factor = torch.where(observed, self.scale_tril, 1)
         else:
@@ -83,12 +86,6 @@ class Gaussian(NamedTuple):
         if type(self.space) is not type(EUCLIDEAN):
             raise TypeError(f"only a Euclidean Gaussian has a MultivariateNormal, this one lives on {self.space!r}")
         return torch.distributions.MultivariateNormal(self.mean, scale_tril=self.factor())
-
-    def index(self, key: object) -> "Gaussian":
-        """Rows ``key`` of the leading dims; a shared factor stays shared."""
-        own = 1 if self.is_diagonal else 2
-        scale = self.scale_tril if self.scale_tril.dim() == own else self.scale_tril[key]  # type: ignore[index]
-        return self._replace(mean=self.mean[key], scale_tril=scale)  # type: ignore[index]
 
 
 def mask_rows(columns: Tensor, observed: Tensor) -> Tensor:

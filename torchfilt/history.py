@@ -101,7 +101,7 @@ class History:
             if belief is not None:
                 named = belief._asdict()
                 parts |= {f"{prefix}.{name}": named[name] for name in named if isinstance(named[name], Tensor)}
-        arrays = {name: value.detach().cpu().numpy() for name, value in parts.items() if value is not None}
+        arrays: dict[str, Any] = {n: value.detach().cpu().numpy() for n, value in parts.items() if value is not None}
         arrays["head"] = np.frombuffer(json.dumps(head, sort_keys=True).encode(), dtype=np.uint8)
         stream = io.BytesIO()
         np.savez(stream, **arrays)
@@ -224,8 +224,13 @@ class Recorder:
             factor = factor.reshape(len(factor), *[1] * missing, *factor.shape[1:])
             beliefs = Gaussian(mean, factor, self.beliefs[0].space)
         elif self.beliefs:
-            rows = [_stack([belief[k] for belief in self.beliefs]) for k in range(3)]  # type: ignore[arg-type]
-            beliefs = Particles(rows[0], rows[1], rows[2], self.beliefs[0].space)  # type: ignore[arg-type]
+            clouds = [belief for belief in self.beliefs if isinstance(belief, Particles)]
+            beliefs = Particles(
+                torch.stack([cloud.x for cloud in clouds]),
+                torch.stack([cloud.log_weights for cloud in clouds]),
+                _stack([cloud.scale_tril for cloud in clouds]),
+                clouds[0].space,
+            )
         return History(mean, info, final, self.evidence, final.belief.space, beliefs, covariance)
 
 

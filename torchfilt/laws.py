@@ -40,6 +40,9 @@ class _Factor(nn.Module):
     gradients reach the caller's own covariance.
     """
 
+    scale_tril: Tensor
+    covariance: Tensor
+
     def __init__(self, covariance: Tensor | None, scale_tril: Tensor | None, trainable: bool) -> None:
         super().__init__()
         if (covariance is None) == (scale_tril is None):
@@ -89,6 +92,10 @@ class LinearGaussian(nn.Module):
         ValueError: shapes that do not fit, a covariance that is not positive semidefinite.
     """
 
+    matrix: Tensor
+    offset: Tensor | None
+    control_matrix: Tensor | None
+
     def __init__(
         self,
         matrix: Tensor,
@@ -113,8 +120,6 @@ class LinearGaussian(nn.Module):
         if control_matrix is not None and control_matrix.shape[-2] != m:
             raise ValueError(f"control_matrix must have {m} rows, got shape {tuple(control_matrix.shape)}")
         hold(self, "matrix", matrix, trainable)
-        self.offset: Tensor | None
-        self.control_matrix: Tensor | None
         for name, tensor in (("offset", offset), ("control_matrix", control_matrix)):
             if tensor is None:
                 setattr(self, name, None)

@@ -52,7 +52,7 @@ class StateSpaceModel(nn.Module):
         """The law called ``name`` as (x, u, dt) -> Gaussian; short cuts that it offers stay visible."""
         law = getattr(self, name)
         if hasattr(law, "linear_form") or hasattr(law, "pooled"):
-            return law  # type: ignore[no-any-return]
+            return law
         return lambda x, u=None, dt=None: as_gaussian(self.conditional(name, x, u, dt))
 
     def is_linear(self) -> bool:
@@ -66,6 +66,9 @@ class StateSpaceModel(nn.Module):
 
 class InitialLaw(nn.Module):
     """Holds the prior, so that it moves with the module; parameters stay parameters."""
+
+    mean: Tensor
+    scale_tril: Tensor
 
     def __init__(self, law: Gaussian | Distribution) -> None:
         super().__init__()

@@ -7,7 +7,7 @@ rest. A quadrature is data; Taylor is the exact derivative. For laws that are li
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -75,16 +75,16 @@ class Taylor:
 
         # One row per direction, so a single forward-mode sweep over the batch gives the whole Jacobian.
         directions = factor.mT.contiguous()
-        _, slope = torch.func.jvp(response, (torch.zeros_like(directions),), (directions,))
+        slope: Tensor = torch.func.jvp(response, (torch.zeros_like(directions),), (directions,))[1]
         return Linearization(at_mean.mean, slope.mT, None, at_mean.factor(), at_mean.space)
 
 
 class Quadrature(NamedTuple):
     """Nodes (s, e) for a standard normal with weights (s,) of the mean and of the covariance.
 
-    ``paired``: nodes are [centre, +c I, -c I], so slope and residual split without a matrix product; ``central`` is then
-    the centre's covariance weight and ``negative`` says whether its mean weight is below zero, both as plain values, so
-    that a compiled step does not branch on tensors.
+    ``paired``: nodes are [centre, +c I, -c I], so slope and residual split without a matrix product; ``central`` is
+    then the centre's covariance weight and ``negative`` says whether its mean weight is below zero, both as plain
+    values, so that a compiled step does not branch on tensors.
     """
 
     nodes: Tensor
@@ -138,9 +138,7 @@ def _split(rule: Quadrature, deviation: Tensor) -> tuple[Tensor, Tensor, Tensor 
     return slope, columns.mT - slope @ nodes.mT, None
 
 
-def _evaluate(
-    law: Law, points: Tensor, rule: Quadrature, u: Tensor | None, dt: Tensor | float | None
-) -> tuple[Gaussian, Tensor]:
+def _evaluate(law: Law, points: Tensor, rule: Quadrature, u: Any, dt: Any) -> tuple[Gaussian, Tensor]:
     """Conditional means at the points and the factor of the weighted mean of the conditional covariances."""
     weights = rule.mean_weights
     pooled = getattr(law, "pooled", None)
@@ -153,7 +151,7 @@ def _evaluate(
     if result.is_diagonal:
         varies = scale.dim() > 1 and scale.shape[-2] > 1
         if varies:
-            # A negative centre weight can make the mean variance negative: the square root is then NaN, and the row fails.
+            # A negative centre weight can make the mean variance negative: its root is NaN, and the row fails.
             scale = (scale.square() * weights.unsqueeze(-1)).sum(-2).sqrt()
         elif scale.dim() > 1:
             scale = scale.squeeze(-2)
@@ -317,7 +315,7 @@ def update(law: Law, prior: Gaussian, y: Tensor, rule: Rule, missing: Missing = 
 
 
 def _observed(space: Space, y: Tensor, missing: Missing) -> Tensor | None:
-    """Mask of the observed tangent components, (..., e), (e,) where all rows share it, None where nothing is missing."""
+    """Mask of the observed tangent components (..., e), (e,) where rows share it; None where nothing is missing."""
     if missing == "none":
         return None
     observed = space.observed(y)

@@ -42,7 +42,7 @@ class ParticleFilter(Filter[Particles]):
         fast_normals: draw float64 normals as float32 and cast them: 3.7 times cheaper, 24 bits fine.
 
     Raises:
-        ValueError: fewer than two particles (a pooled redraw: than e + 2), a move on particles that carry covariances.
+        ValueError: fewer than two particles (pooled redraw: than e + 2), a move on particles with covariances.
 
     Source: Scibior and Wood, Differentiable particle filtering without modifying the forward pass (2021), for gradients.
     """
@@ -248,8 +248,8 @@ def UnscentedParticleFilter(
     """An unscented Kalman filter for each particle, uncertainty shared between spread and local covariance.
 
     The default keeps the fraction ``split`` of the cloud's covariance in each particle and moment-matches the redrawn
-    centres, which is what makes the method robust; ``pooled=False, split=0.0, weights="joint"`` is the proper importance
-    sampler of van der Merwe et al., ``split=None`` the literal form that keeps each P_i in full as well.
+    centres, which is what makes the method robust; ``pooled=False, split=0.0, weights="joint"`` is the proper
+    importance sampler of van der Merwe et al., ``split=None`` the literal form that keeps each P_i in full as well.
 
     Sources: van der Merwe, Doucet, de Freitas, Wan, NIPS 13 (2000); Wei, Song, Zhang (2012), equation 7.
     """
@@ -269,8 +269,8 @@ def LocallyLinearizedParticleFilter(
 ) -> ParticleFilter:
     """A bank of Gaussian filters with weights: the same loop and proposal as the unscented particle filter.
 
-    Particles start as draws that hold the share 1 - split of the prior's covariance and are not redrawn, because drawing
-    from a covariance that is also kept counts it twice.
+    Particles start as draws that hold the share 1 - split of the prior's covariance and are not redrawn, because
+    drawing from a covariance that is also kept counts it twice.
     """
     local = Local(rule or unscented(), redraw, split, pooled, weights)  # type: ignore[arg-type]
     return ParticleFilter(model, particles, local, resampler or ess_below(0.5))
