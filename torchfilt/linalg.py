@@ -2,6 +2,16 @@
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
+
+
+def is_differentiated(*tensors: Tensor) -> bool:
+    """Whether a derivative is taken with respect to any of the tensors, in reverse or in forward mode."""
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        return True
+    if torch.compiler.is_compiling():
+        return False
+    return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
 def triangularize(columns: Tensor) -> Tensor:
@@ -11,10 +21,16 @@ def triangularize(columns: Tensor) -> Tensor:
         columns: (*batch, e, k) with k >= e, any finite numbers.
 
     Returns:
-        (*batch, e, e), lower triangular, diagonal >= 0.
+        (*batch, e, e), lower triangular, diagonal >= 0. Where the rows are linearly dependent the factor has a zero on
+        its diagonal and no derivative (it behaves as a square root at zero): gradients are NaN or infinite there.
+
+    Raises:
+        ValueError: fewer columns than rows.
     """
+    if columns.shape[-1] < columns.shape[-2]:
+        raise ValueError(f"columns must be (*batch, e, k) with k >= e, got shape {tuple(columns.shape)}")
     # mode="r" is half the work but has no derivative; "reduced" has one.
-    mode = "reduced" if torch.is_grad_enabled() and columns.requires_grad else "r"
+    mode = "reduced" if is_differentiated(columns) else "r"
     r = torch.linalg.qr(columns.mT, mode=mode).R
     diagonal = r.diagonal(dim1=-2, dim2=-1)
     sign = torch.where(diagonal < 0, -torch.ones_like(diagonal), torch.ones_like(diagonal))
@@ -29,7 +45,7 @@ def cholesky_downdate(factor: Tensor, vector: Tensor) -> Tensor:
         vector: (*batch, e).
 
     Returns:
-        (*batch, e, e); NaN in the rows of the batch where the difference is not positive definite.
+        (*batch, e, e); all NaN in the rows of the batch where the difference is not positive definite.
 
     Source: Golub and Van Loan, Matrix Computations, section 6.5.
     """
@@ -42,7 +58,10 @@ def cholesky_downdate(factor: Tensor, vector: Tensor) -> Tensor:
         sine = rest[..., j : j + 1] / pivot
         columns.append(cosine * column - sine * rest)
         rest = cosine * rest - sine * column
-    return torch.stack(columns, dim=-1).tril()
+    result = torch.stack(columns, dim=-1).tril()
+    # A negative pivot spoils the columns from its own on; a zero one leaves infinities. One look tells both.
+    broken = ~torch.isfinite(result).all(-1, keepdim=True).all(-2, keepdim=True)
+    return result.masked_fill(broken, torch.nan)
 
 
 def psd_factor(covariance: Tensor, name: str = "covariance") -> Tensor:
@@ -60,25 +79,37 @@ def psd_factor(covariance: Tensor, name: str = "covariance") -> Tensor:
     if not covariance.is_floating_point():
         raise TypeError(f"{name} must be a floating-point tensor, got {covariance.dtype}")
     values = covariance.detach()
-    if not torch.isfinite(values).all():
-        raise ValueError(f"{name} must be finite, got {values.tolist()}")
+    finite = torch.isfinite(values)
+    if not finite.all():
+        raise ValueError(f"{name} must be finite, got {_first(values, ~finite)}")
     scale = values.diagonal(dim1=-2, dim2=-1).abs().amax(-1)
     slack = 64 * torch.finfo(covariance.dtype).eps * covariance.shape[-1]
     skew = (values - values.mT).abs().amax((-2, -1))
-    if (skew > slack * scale).any():
-        raise ValueError(f"{name} must be symmetric, largest difference from its transpose is {skew.max().item():.3g}")
+    skewed = skew > slack * scale
+    if skewed.any():
+        raise ValueError(f"{name} must be symmetric, it differs from its transpose by {_first(skew, skewed)}")
     factor, info = torch.linalg.cholesky_ex(covariance)
     if not info.any():
         return factor
     eigenvalues, vectors = torch.linalg.eigh(covariance)
     lowest = eigenvalues.detach().amin(-1)
-    if (lowest < -slack * scale).any():
-        raise ValueError(f"{name} must be positive semidefinite, its lowest eigenvalue is {lowest.min().item():.3g}")
-    return triangularize(vectors * eigenvalues.clamp_min(0).sqrt().unsqueeze(-2))
+    negative = lowest < -slack * scale
+    if negative.any():
+        raise ValueError(f"{name} must be positive semidefinite, its lowest eigenvalue is {_first(lowest, negative)}")
+    singular = triangularize(vectors * eigenvalues.clamp_min(0).sqrt().unsqueeze(-2))
+    return torch.where((info == 0)[..., None, None], factor, singular)
+
+
+def _first(values: Tensor, bad: Tensor) -> str:
+    """The first bad value, with its place where there are several."""
+    place = tuple(bad.nonzero()[0].tolist())
+    return f"{values[place].item():.6g}" + (f" at {place}" if place else "")
 
 
 def apply_factor(factor: Tensor, vectors: Tensor, *, diagonal: bool = False) -> Tensor:
     """``factor @ v`` for each vector, one matrix product when the factor is shared.
+
+    The library behind float32 products may round differently with another number of threads; in float64 it does not.
 
     Args:
         factor: (e, e), (*batch, 1, e, e) or one per vector (*batch, n, e, e); with ``diagonal``, (..., e).

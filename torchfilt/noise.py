@@ -49,8 +49,8 @@ class NoiseSource(NamedTuple):
     def seed_of(self, step: int, stream: int) -> int:
         """Seed for a sampler that draws by itself, in [0, 2^63).
 
-        The generator of the CPU reads the low 32 bits only: drawn at random, two of 80,000 would be equal more often than
-        not. Here all steps below 2^28 and streams of one seed differ in them.
+        The generator of the CPU reads the low 32 bits only: of 80,000 seeds taken at random two would be equal more
+        often than not. Here all steps below 2^28 and all streams of one seed differ in them.
 
         Raises:
             ValueError: stream outside [0, 16).

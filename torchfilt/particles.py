@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfilt.spaces import EUCLIDEAN, Space, weighted_sum
+from torchfilt.spaces import EUCLIDEAN, Space, steady_sum, weighted_sum
 
 
 class Particles(NamedTuple):
@@ -58,14 +58,19 @@ class Particles(NamedTuple):
         return (own * weights[..., None, None]).sum(-3)
 
 
+# Numbers that the outer products of all particles may fill at once; above, one row of the matrix at a time.
+_BLOCK = 1 << 20
+
+
 def second_moment(deviation: Tensor, weights: Tensor) -> Tensor:
-    """Weighted sum of outer products of deviations (*batch, n, e): elementwise, so the same bits for any thread count."""
-    by_component = deviation.movedim(-1, 0)
+    """Weighted sum (*batch, e, e) of outer products of errors (*batch, n, e): the same bits for any thread count."""
+    by_component = deviation.movedim(-1, 0).contiguous()
     weighted = by_component * weights
-    size = deviation.shape[-1]
-    rows = [(weighted[i] * by_component[: i + 1]).sum(-1) for i in range(size)]
-    lower = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)  # (e, e, *batch), zeros above the diagonal
-    lower = lower.movedim((0, 1), (-2, -1))
+    if by_component.numel() * len(by_component) <= _BLOCK:
+        rows = steady_sum(weighted.unsqueeze(1) * by_component, -1)
+    else:
+        rows = torch.stack([steady_sum(row * by_component, -1) for row in weighted])
+    lower = rows.movedim((0, 1), (-2, -1)).tril()
     return lower + lower.tril(-1).mT
 
 

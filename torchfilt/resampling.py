@@ -1,10 +1,12 @@
-"""Resamplers: from weights to ancestor indices. Uniforms come in as an argument, so every resampler is a pure function."""
+"""Resamplers, from weights to ancestor indices: pure functions, because the uniforms come in as an argument."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+from torchfilt.spaces import steady_sum
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,11 @@ class Resampler:
         return 1 if self.one_uniform else n
 
     def __call__(self, weights: Tensor, uniforms: Tensor) -> Tensor:
-        """Ancestor indices (*batch, n)."""
+        """Ancestor indices (*batch, n), ascending.
+
+        Weights need not sum to one, but must be finite and not negative with a positive sum: of others the indices are
+        in range and mean nothing, and it is for the caller to look.
+        """
         return self.ancestors(weights, uniforms)
 
 
@@ -36,8 +42,8 @@ def _counts_to_ancestors(ends: Tensor) -> Tensor:
     ancestor(i) = number of particles j < n - 1 with ends(j) <= i, a running sum of a histogram: O(n), no search.
     """
     n = ends.shape[-1]
-    flat = ends[..., :-1].reshape(-1, n - 1)
-    rows = flat.shape[0]
+    rows = ends.numel() // n
+    flat = ends[..., :-1].reshape(rows, n - 1)
     if torch.compiler.is_compiling():  # bincount has no static shape
         histogram = torch.zeros(rows, n + 1, dtype=torch.int64, device=ends.device)
         histogram = histogram.scatter_add(1, flat, torch.ones_like(flat))
@@ -75,22 +81,23 @@ def _multinomial(weights: Tensor, u: Tensor) -> Tensor:
     n = weights.shape[-1]
     cumulative = weights.to(torch.float64).cumsum(-1)
     sorted_u = u.sort(-1).values * cumulative[..., -1:]
-    return torch.searchsorted(cumulative, sorted_u, right=True).clamp_max(n - 1)
+    return torch.searchsorted(cumulative.contiguous(), sorted_u.contiguous(), right=True).clamp_max(n - 1)
 
 
 def _residual(weights: Tensor, u: Tensor) -> Tensor:
     """Whole copies first, the rest drawn from the fractional parts."""
     n = weights.shape[-1]
     scaled = weights.to(torch.float64)
-    scaled = scaled * (n / scaled.sum(-1, keepdim=True))
-    copies = scaled.floor()
-    fraction = scaled - copies
+    scaled = scaled * (n / steady_sum(scaled, -1).unsqueeze(-1))
+    # Rounding must not turn a whole copy into a draw: equal weights give n ones, and 49 * (1 / 49) is below one.
+    copies = (scaled * (1 + 8 * torch.finfo(scaled.dtype).eps)).floor()
+    fraction = (scaled - copies).clamp_min(0)
     kept = copies.sum(-1, keepdim=True)
     # The first n - kept uniforms are used; the rest are pushed past the end so that they add nothing.
     index = torch.arange(n, device=weights.device)
     cumulative = fraction.cumsum(-1)
     total = cumulative[..., -1:]
-    picks = torch.searchsorted(cumulative, (u * total).contiguous(), right=True).clamp_max(n - 1)
+    picks = torch.searchsorted(cumulative.contiguous(), (u * total).contiguous(), right=True).clamp_max(n - 1)
     used = (index < n - kept).to(torch.float64)
     counts = copies.scatter_add(-1, picks, used)
     return _counts_to_ancestors(counts.cumsum(-1).round().long().clamp_(0, n))
