@@ -350,6 +350,10 @@ def _condition(
     nis = z.square().sum(-1)
     log_likelihood = -0.5 * nis - log_abs_diagonal(innovation_factor) - 0.5 * LOG_2PI * counted
     mean = prior.space.retract(prior.mean, apply_factor(gain, z))
+    if observed is not None:  # rows without any measurement keep the prior to the bit
+        seen = observed.any(-1)
+        mean = torch.where(seen.unsqueeze(-1), mean, prior.mean)
+        posterior_factor = torch.where(seen[..., None, None], posterior_factor, root)
     posterior = Gaussian(mean, posterior_factor, prior.space)
     return Update(posterior, log_likelihood, innovation, innovation_factor, nis)
 
