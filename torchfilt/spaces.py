@@ -271,6 +271,8 @@ class Product:
 def _heaviest(points: Tensor, weights: Tensor) -> Tensor:
     """Point (..., d) of the largest weight in magnitude, the first among equals."""
     best = weights.abs().argmax(-1, keepdim=True).unsqueeze(-1)
+    # One set of weights may serve a batch of point sets.
+    best = best.expand(*points.shape[:-2], 1, 1)
     return torch.take_along_dim(points, best, -2).squeeze(-2)
 
 

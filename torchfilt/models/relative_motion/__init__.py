@@ -28,6 +28,7 @@ from torchfilt.models.relative_motion.frames import (
     to_hill,
 )
 from torchfilt.models.relative_motion.gravity import EARTH_RADIUS_M, J2_EARTH, MU_M3_S2, Field
+from torchfilt.models.relative_motion.latent_force import HarmonicForce
 from torchfilt.models.relative_motion.nominal import LinearTimeVarying, TwoBody
 from torchfilt.models.relative_motion.radar import RADAR_SPACE, RendezvousRadar, line_of_sight
 from torchfilt.models.relative_motion.ranging import BiasedRanging, WithConstant
@@ -52,6 +53,7 @@ __all__ = [
     "Field",
     "Formation",
     "FormationSettings",
+    "HarmonicForce",
     "LinearTimeVarying",
     "RendezvousRadar",
     "TwoBody",

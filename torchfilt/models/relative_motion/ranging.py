@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import LinearForm, hold
 from torchfilt.models.relative_motion.radar import RADAR_SPACE, RendezvousRadar
+from torchfilt.models.relative_motion.transforms import block_diagonal
 
 Step = Tensor | float | None
 
@@ -61,7 +62,7 @@ class WithConstant(nn.Module):
         one = torch.eye(self.size, dtype=matrix.dtype, device=matrix.device)
         if offset is not None:
             offset = torch.nn.functional.pad(offset, (0, self.size))
-        return LinearForm(_block(matrix, one), offset, _block(scale_tril, self._drift(scale_tril, dt)))
+        return LinearForm(block_diagonal(matrix, one), offset, block_diagonal(scale_tril, self._drift(scale_tril, dt)))
 
     def _extend(self, inner: Gaussian, constants: Tensor, dt: Step) -> Gaussian:
         mean = torch.cat([inner.mean, constants.expand(*inner.mean.shape[:-1], self.size)], -1)
@@ -71,7 +72,7 @@ class WithConstant(nn.Module):
             lead = torch.broadcast_shapes(inner.scale_tril.shape[:-1], own.shape[:-1])
             parts = [part.expand(*lead, part.shape[-1]) for part in (inner.scale_tril, own)]
             return Gaussian(mean, torch.cat(parts, -1), inner.space, True)
-        return Gaussian(mean, _block(inner.scale_tril, drift), inner.space)
+        return Gaussian(mean, block_diagonal(inner.scale_tril, drift), inner.space)
 
     def _drift(self, like: Tensor, dt: Step) -> Tensor:
         """Factor (..., size, size) of what the constants gain in a step."""
@@ -83,15 +84,6 @@ class WithConstant(nn.Module):
         variance: Tensor = psd * dt
         lead = dt.shape[:-1] if isinstance(dt, Tensor) else ()
         return torch.diag_embed(variance.sqrt().expand(*lead, self.size).to(like.dtype))
-
-
-def _block(first: Tensor, second: Tensor) -> Tensor:
-    """Block-diagonal matrix, leading dims broadcast."""
-    lead = torch.broadcast_shapes(first.shape[:-2], second.shape[:-2])
-    m, n = first.shape[-1], second.shape[-1]
-    top = torch.nn.functional.pad(first, (0, n)).expand(*lead, first.shape[-2], m + n)
-    bottom = torch.nn.functional.pad(second, (m, 0)).expand(*lead, second.shape[-2], m + n)
-    return torch.cat([top, bottom], -2)
 
 
 class BiasedRanging(nn.Module):

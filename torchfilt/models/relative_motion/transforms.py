@@ -68,3 +68,12 @@ def white_acceleration_factor(psd_m2_s3: Tensor, dt: Tensor | float, rate_rad_s:
         [torch.cat([position, torch.zeros_like(position)], -1), torch.cat([3**0.5 * half, half], -1)], -2
     )
     return rate_matrix(rate_rad_s) @ factor
+
+
+def block_diagonal(first: Tensor, second: Tensor) -> Tensor:
+    """Block-diagonal matrix (..., m + n, m + n) of (..., m, m) and (..., n, n), leading dims broadcast."""
+    lead = torch.broadcast_shapes(first.shape[:-2], second.shape[:-2])
+    m, n = first.shape[-1], second.shape[-1]
+    top = torch.nn.functional.pad(first, (0, n)).expand(*lead, first.shape[-2], m + n)
+    bottom = torch.nn.functional.pad(second, (m, 0)).expand(*lead, second.shape[-2], m + n)
+    return torch.cat([top, bottom], -2)
