@@ -76,15 +76,15 @@ class Local:
 
     * ``split`` s: draw x ~ N(x_i, (1 - s) P_i) and keep s P_i, which leaves the mixture as it is. 0 makes points.
       None is the literature's literal form: draw from all of P_i and keep all of P_i, counting it twice.
-    * ``pooled``: the fraction s is taken of the whole cloud's covariance V, not of P_i: draws are matched to the cloud's
-      mean m and covariance V, shrunk to m + sqrt(1 - s) (x - m), and every particle gets s V. Mean and covariance of the
-      cloud stay as they are; its shape becomes smoother, so the evidence is approximate.
+    * ``pooled``: the fraction s is taken of the whole cloud's covariance V, not of P_i: draws are matched to the
+      cloud's mean m and covariance V, shrunk to m + sqrt(1 - s) (x - m), and every particle gets s V. Mean and
+      covariance of the cloud stay as they are; its shape becomes smoother, so the evidence is approximate.
     * ``redraw``: "never" again after the start, "resample" in rows that were just resampled, or "always".
 
-    Weights: "marginal" is each particle's innovation likelihood N(y; y_i, S_i), with the draw put off to the next step;
-    "joint" draws x at once from N(x_i+, P_i+) and weights by p(y|x) N(x; x_i-, P_i-) / N(x; x_i+, P_i+). With split 0
-    particles are points, N(x_i-, P_i-) is the transition law itself, and joint weights are proper importance weights. On
-    linear-Gaussian models both are the same number.
+    Weights: "marginal" is each particle's innovation likelihood N(y; y_i, S_i), with the draw put off to the next
+    step; "joint" draws x at once from N(x_i+, P_i+) and weights by p(y|x) N(x; x_i-, P_i-) / N(x; x_i+, P_i+). With
+    split 0 particles are points, the transition law itself takes the place of N(x_i-, P_i-) in the ratio, and joint
+    weights are proper importance weights. On linear-Gaussian models both are the same number.
 
     Args:
         rule: moment rule.
@@ -93,8 +93,8 @@ class Local:
     Raises:
         ValueError: split outside [0, 1], combinations that have no meaning.
 
-    Sources: van der Merwe, Doucet, de Freitas, Wan, The unscented particle filter, NIPS 13 (2000); Liu and West, Combined
-    parameter and state estimation (2001), for the pooled kernel.
+    Sources: van der Merwe, Doucet, de Freitas, Wan, The unscented particle filter, NIPS 13 (2000); Liu and West,
+    Combined parameter and state estimation (2001), for the pooled kernel.
     """
 
     rule: Rule
@@ -142,7 +142,12 @@ class Local:
         return self.weights == "joint" and self.split is not None
 
     def start(self, initial: Conditional, draws: Tensor, noise: Tensor) -> Particles:
-        """The initial law's moments as n equal Gaussians, then split between spread and local covariance."""
+        """The initial law's moments as n equal Gaussians, then split between spread and local covariance.
+
+        With split 0 the particles are the draws themselves, whatever the law.
+        """
+        if self.split == 0 and not self.pooled:
+            return _equal_weights(draws, None, _space_of(initial))
         prior = as_gaussian(initial)
         mean = prior.mean.unsqueeze(-2).expand_as(draws)
         factor = prior.factor().unsqueeze(-3).expand(*draws.shape[:-2], 1, -1, -1)
@@ -223,26 +228,28 @@ class Local:
         if not move and particles.scale_tril is None:
             # Points that stand still have no law to be drawn from again: the measurement weights them.
             return Prior()(model, particles, y, u, dt, noise, missing, move)
-        predicted = self._predict(model, particles, u, dt, move)
+        predicted, arrival = self._predict(model, particles, u, dt, move)
         result = update(model.moments("observation"), predicted, y, self.rule, missing)
         posterior = result.belief
         if self.weights == "marginal":
             return Proposed(posterior.mean, posterior.scale_tril, result.log_likelihood, posterior.space)
         assert noise.proposal is not None
         x = posterior.sample(noise.proposal)
-        ratio = predicted.log_prob(x) - posterior.log_prob(x)
+        ratio = log_prob(arrival, x, "none") - posterior.log_prob(x)
         log_weight = log_prob(model.conditional("observation", x), y, missing) + ratio
         return Proposed(x, None if self.split == 0 else posterior.scale_tril, log_weight, posterior.space)
 
     def _predict(
         self, model: StateSpaceModel, particles: Particles, u: Tensor | None, dt: Step, move: bool
-    ) -> Gaussian:
-        law = model.moments("transition")
+    ) -> tuple[Gaussian, Conditional]:
+        """Predicted Gaussians, and the law that joint weights are made with: the transition itself for points."""
         if particles.scale_tril is not None:
             bank = Gaussian(particles.x, particles.scale_tril, particles.space)
-            return predict(law, bank, self.rule, u, dt) if move else bank
-        step = law(particles.x, u, dt)
-        return step._replace(scale_tril=step.factor(), is_diagonal=False)
+            predicted = predict(model.moments("transition"), bank, self.rule, u, dt) if move else bank
+            return predicted, predicted
+        law = model.conditional("transition", particles.x, u, dt)
+        step = as_gaussian(law)
+        return step._replace(scale_tril=step.factor(), is_diagonal=False), law
 
 
 def _equal_weights(x: Tensor, factor: Tensor | None, space: Space) -> Particles:

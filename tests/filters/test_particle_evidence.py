@@ -1,7 +1,7 @@
 """The evidence: exp(log_likelihood) is unbiased for every proper form, and says so where it is not.
 
-Replicates are rows of one batch with the same data. Each z-score is held to 4.5 standard errors, a false alarm in 150,000
-tests; the standard error is asserted too, so that a bias of 4.5 times it would be seen.
+Replicates are rows of one batch with the same data. Each z-score is held to 4.5 standard errors, a false alarm in
+150,000 tests; the standard error is asserted too, so that a bias of 4.5 times it would be seen.
 """
 
 import numpy as np
@@ -187,7 +187,7 @@ def test_nonlinear_evidence_is_unbiased(policy, kind):
 
 
 def test_joint_weights_start_from_the_initial_law_itself():
-    """A two-sided initial law: its Gaussian of equal moments would be far off. One measurement, answer by quadrature."""
+    """A two-sided initial law: its Gaussian of equal moments would be far off. One measurement, answer by a grid."""
     initial = torch.distributions.Laplace(tensor([0.5]), tensor([1.5]))
     model = tf.StateSpaceModel(
         initial, tf.AdditiveGaussian(step, tensor([[0.5]])), tf.AdditiveGaussian(bend, tensor([[0.25]]))
@@ -211,8 +211,8 @@ def test_joint_weights_start_from_the_initial_law_itself():
 def test_pooled_form_is_approximate_and_says_so():
     """Shrinkage smooths the shape of the cloud: the bias of Z is measured, and falls as n grows.
 
-    The linear model keeps the cloud Gaussian, so the bias is of order 1/n and vanishes in the limit; on the curved model
-    the limit itself is off.
+    The linear model keeps the cloud Gaussian, so the bias is of order 1/n and vanishes in the limit; on the curved
+    model the limit itself is off.
     """
     ys, exact = series(4)
     biases = {}
@@ -238,7 +238,7 @@ def test_pooled_form_stays_biased_on_a_curved_model():
 
 
 def test_literal_form_counts_uncertainty_twice():
-    """Drawing from P_i and keeping P_i: evidence and covariance approach those of the doubled cloud, not the exact ones.
+    """Drawing from P_i and keeping P_i: evidence and covariance approach those of the doubled cloud.
 
     Evidence: 4.5 standard errors and a bias of the logarithm of half its variance; covariance: 2 %.
     """
