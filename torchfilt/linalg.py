@@ -29,8 +29,9 @@ def triangularize(columns: Tensor) -> Tensor:
     """
     if columns.shape[-1] < columns.shape[-2]:
         raise ValueError(f"columns must be (*batch, e, k) with k >= e, got shape {tuple(columns.shape)}")
-    # mode="r" is half the work but has no derivative; "reduced" has one.
-    mode = "reduced" if is_differentiated(columns) else "r"
+    # mode="r" is half the work, but has no derivative and fails under nested `torch.vmap`; "reduced" does it all.
+    whole = is_differentiated(columns) or torch._C._are_functorch_transforms_active()
+    mode = "reduced" if whole else "r"
     r = torch.linalg.qr(columns.mT, mode=mode).R
     diagonal = r.diagonal(dim1=-2, dim2=-1)
     sign = torch.where(diagonal < 0, -torch.ones_like(diagonal), torch.ones_like(diagonal))

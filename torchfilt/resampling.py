@@ -90,10 +90,10 @@ def _residual(weights: Tensor, u: Tensor) -> Tensor:
     scaled = weights.to(torch.float64)
     scaled = scaled * (n / steady_sum(scaled, -1).unsqueeze(-1))
     # Rounding must not turn a whole copy into a draw: equal weights give n ones, and 49 * (1 / 49) is below one.
-    copies = (scaled * (1 + 8 * torch.finfo(scaled.dtype).eps)).floor()
+    copies = (scaled * (1 + 64 * torch.finfo(scaled.dtype).eps)).floor()
     fraction = (scaled - copies).clamp_min(0)
     kept = copies.sum(-1, keepdim=True)
-    # The first n - kept uniforms are used; the rest are pushed past the end so that they add nothing.
+    # The first n - kept uniforms are used; the rest draw as well, and count for nothing.
     index = torch.arange(n, device=weights.device)
     cumulative = fraction.cumsum(-1)
     total = cumulative[..., -1:]
