@@ -1,0 +1,73 @@
+"""Results of long computations kept in a run folder, so that an interrupted run goes on where it stood."""
+
+import hashlib
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchfilt.storage import IntegrityError, manifest_path, read_verified, write_verified
+
+Arrays = dict[str, np.ndarray]
+FILE_KIND = "torchfilt stage"
+
+
+class Stages:
+    """Named stages of a run; each is kept under a digest of its recipe, so that other settings never meet old results.
+
+    Args:
+        folder: where they lie; None keeps nothing.
+        say: told in one line what is read or refused.
+    """
+
+    def __init__(self, folder: str | Path | None, say: Callable[[str], None] = lambda line: None) -> None:
+        self.folder = None if folder is None else Path(folder)
+        self.say = say
+
+    def path(self, name: str, recipe: dict[str, Any], suffix: str = "npz") -> Path | None:
+        """File of a stage; the recipe is JSON-ready."""
+        if self.folder is None:
+            return None
+        digest = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:12]
+        return self.folder / f"{name}-{digest}.{suffix}"
+
+    def get(self, name: str, recipe: dict[str, Any], compute: Callable[[], Arrays]) -> Arrays:
+        """Arrays of a stage: read where a whole file of this recipe exists, else computed and kept.
+
+        Args:
+            name: of the stage.
+            recipe: everything the result depends on.
+            compute: makes the arrays.
+        """
+        path = self.path(name, recipe)
+        if path is not None and path.is_file():
+            try:
+                return _read(path)
+            except IntegrityError as error:
+                self.say(f"{error}; computed again")
+        arrays = compute()
+        if path is not None:
+            stream = io.BytesIO()
+            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+            write_verified(path, stream.getvalue(), FILE_KIND)
+        return arrays
+
+    def clear(self) -> None:
+        """Delete the stages of all recipes; other files in the folder stay."""
+        if self.folder is None or not self.folder.is_dir():
+            return
+        for path in self.folder.glob("*.npz"):
+            manifest_path(path).unlink(missing_ok=True)
+            path.unlink()
+
+
+def _read(path: Path) -> Arrays:
+    data = read_verified(path, FILE_KIND)
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (ValueError, OSError, KeyError) as error:
+        raise IntegrityError(f"{path}: not a stage of this version ({error})") from None
