@@ -228,7 +228,7 @@ def test_neighbours_in_a_batch_change_nothing(rule):
         if hidden:
             ys[2, 2, 0] = np.nan
         before = filter(tensor(ys), tensor(p.us), tensor(p.dts))
-        ys[:, 1] = 1e140
+        ys[:, 1] = 1e6
         after = filter(tensor(ys), tensor(p.us), tensor(p.dts))
         for row in (0, 2):
             assert torch.equal(before.mean[:, row], after.mean[:, row])

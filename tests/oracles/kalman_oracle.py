@@ -79,3 +79,25 @@ def score(log_likelihood: Callable[[Array], complex], theta: Array) -> Array:
     """Gradient of an analytic function of theta (p,) by complex steps: exact to rounding."""
     step = 1e-30
     return np.array([log_likelihood(theta + 1j * step * unit).imag / step for unit in np.eye(len(theta))])
+
+
+def kalman_scalar(
+    m0: Array, p0: Array, f: Array, q: Array, h: Array, r: float, ys: Array, dtype: type = np.longdouble
+) -> Filtered:
+    """The same for scalar measurements ys (t) in extended precision: h (d,), r a variance.
+
+    Returns the last mean (d,) and covariance (d, d), and log_likelihood (t).
+    """
+    mean, p, f, q, h = (np.asarray(value, dtype) for value in (m0, p0, f, q, h))
+    r, two_pi = dtype(r), 2 * np.arccos(dtype(-1))
+    likelihoods = []
+    eye = np.eye(len(mean), dtype=dtype)
+    for y in ys.astype(dtype):
+        mean, p = f @ mean, f @ p @ f.T + q
+        s = h @ p @ h + r
+        gain = p @ h / s
+        innovation = y - h @ mean
+        keep = eye - np.outer(gain, h)
+        mean, p = mean + gain * innovation, keep @ p @ keep.T + r * np.outer(gain, gain)
+        likelihoods.append(-0.5 * (innovation**2 / s + np.log(two_pi * s)))
+    return Filtered(mean, p, np.array(likelihoods))
