@@ -85,7 +85,12 @@ def run_training(
     _write_json(folder / SETTINGS, settings.to_dict())
     _write_json(folder / VERSIONS, versions)
     train = data.training
-    say(f"{len(train.x)} pairs from {settings.source}, steps of {settings.dt:g} s, nominal law: {settings.nominal}")
+    size, rank = train.x.shape[1], _rank(train.x)
+    say(f"{len(train.x)} pairs from {settings.source}, steps of {settings.step:g} s, nominal law: {settings.nominal}")
+    if rank < size:
+        say(
+            f"the training states fill {rank} of {size} directions: elsewhere the law extrapolates, expect errors there"
+        )
     law, report = _train(data, settings, folder, stop, progress)
     if report.interrupted:
         say(f"stopped after {report.epochs} epochs")
@@ -94,10 +99,10 @@ def run_training(
     metrics = {
         "seed": settings.seed,
         "versions": versions,
-        "data": {"source": settings.source, "pairs": len(train.x), "sha256": digests},
+        "data": {"source": settings.source, "pairs": len(train.x), "rank": rank, "sha256": digests},
         "training": _training(report),
         "one_step": {name: _one_step(law, pairs, settings) for name, pairs in data.tests.items()},
-        "roll_out": {name: _roll_out(law, track, settings) for name, track in data.tracks.items()},
+        "roll_out": {name: _roll_out(name, law, track, settings) for name, track in data.tracks.items()},
     }
     metrics = _finite(metrics)
     _report(metrics, say)
@@ -253,14 +258,16 @@ def _distances(law: Law, track: Track, s: RunSettings, dtype: torch.dtype, part:
     return torch.linalg.vector_norm((states.to(track.states) - track.states)[:, part], dim=-1)
 
 
-def _roll_out(law: GPTransition, track: Track, s: RunSettings) -> dict[str, Any]:
+def _roll_out(name: str, law: GPTransition, track: Track, s: RunSettings) -> dict[str, Any]:
     """Largest distance of free roll-outs from the truth."""
-    result: dict[str, Any] = {"steps": len(track.controls)}
-    for name, part in _ORBITAL.items():
-        result[name] = float(_distances(law, track, s, _dtype(s), part).max())
+    # Trained on one trajectory, the GP only repeats it when it starts there.
+    seen = s.source == "trajectory" and name == "nominal_start"
+    result: dict[str, Any] = {"steps": len(track.controls), "in_sample": seen}
+    for quantity, part in _ORBITAL.items():
+        result[quantity] = float(_distances(law, track, s, _dtype(s), part).max())
         if law.nominal is not None:
             alone = float(_distances(law.nominal, track, s, torch.float64, part).max())
-            result.setdefault("nominal", {})[name] = alone
+            result.setdefault("nominal", {})[quantity] = alone
     return result
 
 
@@ -282,7 +289,8 @@ def _report(metrics: dict[str, Any], say: Say) -> None:
         for name, entry in metrics["roll_out"].items():
             nominal = entry.get("nominal", {}).get("position_m")
             before = "-" if nominal is None else f"{nominal:.2e}"
-            say(f"{name:<18}{entry['steps']:<14}{before:>10}{_number(entry['position_m'], '.2e'):>10}")
+            seen = "  in sample: no test" if entry["in_sample"] else ""
+            say(f"{name:<18}{entry['steps']:<14}{before:>10}{_number(entry['position_m'], '.2e'):>10}{seen}")
     say("")
     say("z is error / the GP's own standard deviation (1: honest); z + floor counts the nominal law's noise as well.")
 
@@ -427,6 +435,13 @@ def _revision() -> str | None:
         return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "-uno") else "")
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def _rank(x: Tensor) -> int:
+    """Directions that standardised states (S, d) fill to more than 0.005 of the widest one."""
+    scale = x.std(0)
+    values = torch.linalg.svdvals((x - x.mean(0)) / torch.where(scale > 0, scale, torch.ones_like(scale)))
+    return int((values > 0.005 * values[0]).sum())
 
 
 def _finite(value: Any) -> Any:

@@ -128,7 +128,7 @@ def resolve(settings: RunSettings, controls: int | None, state: int, dt: float |
         raise UsageError("--psd is the noise of a nominal law, and --nominal is none")
     if s.phase and s.phase_column is None and not orbital:
         raise UsageError(
-            f"{s.source} has no chief-orbit controls u (S, 21) to take the phase from: give --phase-column or --phase false"
+            f"{s.source} has no chief-orbit controls u (S, 21) for the phase: give --phase-column or --phase false"
         )
     for column in (*s.control_columns, *([] if s.phase_column is None else [s.phase_column])):
         if not 0 <= column < (controls or 0):
