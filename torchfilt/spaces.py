@@ -6,9 +6,9 @@ A space turns a tangent vector (the error, e numbers) into a point (d numbers) a
 """
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Protocol, runtime_checkable
 
-import roma
 import torch
 from torch import Tensor
 
@@ -147,6 +147,13 @@ class Angle:
         return ~torch.isnan(y)
 
 
+def _roma() -> ModuleType:
+    """RoMa, loaded with the first rotation: it brings the compiler of torch, a second of loading."""
+    import roma
+
+    return roma
+
+
 @dataclass(frozen=True)
 class UnitQuaternion:
     """Rotations as unit quaternions, order x y z w (RoMa's); q and -q are the same point.
@@ -173,12 +180,14 @@ class UnitQuaternion:
 
     def retract(self, x: Tensor, v: Tensor) -> Tensor:
         """Rotation x turned by the rotation vector v; the norm is restored."""
+        roma = _roma()
         x, step = torch.broadcast_tensors(x, roma.rotvec_to_unitquat(v))
         turned = roma.quat_product(x, step) if self.side == "right" else roma.quat_product(step, x)
         return self.project(turned)
 
     def local(self, x: Tensor, y: Tensor) -> Tensor:
         """Rotation vector (at most pi long) that turns x into y."""
+        roma = _roma()
         x, y = torch.broadcast_tensors(x, y)
         inverse = roma.quat_conjugation(x)
         turn = roma.quat_product(inverse, y) if self.side == "right" else roma.quat_product(y, inverse)
