@@ -1,0 +1,37 @@
+"""GRACE A and B on 27 July 2010: dynamics learned from the first hours of the log, the pair tracked through the next.
+
+Names load what they need when first used.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_HOMES = {
+    "GraceData": "data",
+    "GraceSettings": "settings",
+    "build_data": "data",
+    "Dynamics": "learning",
+    "learn": "learning",
+    "PotentialFit": "potential_gp",
+    "PotentialGP": "potential_gp",
+    "PotentialTransition": "potential_gp",
+    "fit_potential": "potential_gp",
+    "predict_from": "prediction",
+    "prediction_errors": "prediction",
+    "Case": "tracking",
+    "simulate_case": "tracking",
+    "track": "tracking",
+    "run": "campaign",
+}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

@@ -1,0 +1,194 @@
+"""The pair tracked from angles and a range: models, filters, scores against the precise orbits."""
+
+import time
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchfilt.filters.gaussian import UnscentedKalmanFilter
+from torchfilt.filters.particle import UnscentedParticleFilter
+from torchfilt.gaussian import Gaussian
+from torchfilt.history import History
+from torchfilt.missions.grace.data import GraceData
+from torchfilt.missions.grace.learning import POTENTIAL, Dynamics
+from torchfilt.missions.grace.settings import GraceSettings
+from torchfilt.model import StateSpaceModel
+from torchfilt.models.relative_motion import BiasedRanging, RendezvousRadar, WithConstant
+from torchfilt.noise import NoiseSource
+from torchfilt.run import Filter
+
+FILTERS = ("nominal-ukf", "gp-ukf", "mf-upf")
+NOMINAL = "J2"
+CaseName = Literal["kband", "radar"]
+# Purposes of random numbers, keys of the noise source.
+_PRIOR, _ANGLES, _RANGE = 0, 1, 2
+_AXES = ("radial", "along", "across")
+
+
+class Case(NamedTuple):
+    """What a filter is given, and what it should find.
+
+    name: "kband", the K-band range as it was recorded with its bias in the state, or "radar", a simulated range.
+    measurements (t, rows, 3), NaN where not measured; rows are the runs, and for "kband" the runs once more with
+    outages. prior: means (rows, d). truth (t, 6). runs: R. outages: rows of the measurements without any.
+    """
+
+    name: CaseName
+    observation: nn.Module
+    measurements: Tensor
+    prior: Gaussian
+    truth: Tensor
+    runs: int
+    outages: list[range]
+
+
+def simulate_case(data: GraceData, settings: GraceSettings, name: CaseName) -> Case:
+    """Measurements of all runs through the tracking hours.
+
+    Angles are simulated: of the true positions, with noise, in the true chief's axes; the filters take the chief's mean
+    radius instead, which turns the axes by up to 5e-5 rad. Runs differ by the noise of angles (and simulated range) and
+    by the prior's error; the K-band record is one.
+    """
+    first, count, runs = settings.training_steps, settings.tracking_steps, settings.runs
+    truth = data.states[first + 1 : first + 1 + count]
+    source = NoiseSource(settings.seed)
+    angle_sd = torch.deg2rad(torch.tensor(settings.angle_3sigma_deg / 3, dtype=torch.float64))
+    range_sd = settings.range_sd_m if name == "kband" else settings.radar_range_sd_m
+    chief = torch.linalg.vector_norm(data.chief.position_m, dim=-1)[:: settings.stride]
+    exact = RendezvousRadar(chief[first + 1 : first + 1 + count]).measure(truth).unsqueeze(1)
+    angles = exact[..., 1:] + angle_sd * source.normal((count, runs, 2), 0, _ANGLES, truth)
+    if name == "kband":
+        distance = data.range_m[first + 1 : first + 1 + count, None, None].expand(-1, runs, 1)
+    else:
+        distance = exact[..., :1] + range_sd * source.normal((count, runs, 1), 0, _RANGE, truth)
+    measurements = torch.cat([distance, angles], -1)
+    deviation = torch.tensor([settings.prior_sd_m] * 3 + [settings.prior_sd_m_s] * 3, dtype=torch.float64)
+    start = data.states[first] + deviation * source.normal((runs, 6), 0, _PRIOR, truth)
+    radius = float(chief[: first + 1].mean())
+    if name == "radar":
+        radar = RendezvousRadar(radius, range_sd, angle_sd, angle_sd)
+        prior = Gaussian(start, torch.diag(deviation))
+        return Case(name, radar, measurements, prior, truth, runs, [])
+    gaps = measurements.clone()
+    for rows in settings.outage_rows:
+        gaps[rows.start : rows.stop] = torch.nan
+    deviation = torch.cat([deviation, deviation.new_tensor([settings.bias_sd_m])])
+    mean = torch.nn.functional.pad(start, (0, 1)).repeat(2, 1)
+    return Case(
+        name,
+        BiasedRanging(radius, range_sd, angle_sd, angle_sd),
+        torch.cat([measurements, gaps], 1),
+        Gaussian(mean, torch.diag(deviation)),
+        truth,
+        runs,
+        settings.outage_rows,
+    )
+
+
+def make_filter(name: str, case: Case, dynamics: dict[str, Dynamics], settings: GraceSettings) -> Filter[Any]:
+    """A filter by its name in `FILTERS`.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if name not in FILTERS:
+        raise ValueError(f"filter must be one of {', '.join(FILTERS)}, got {name!r}")
+    transition = _dynamics_of(name, dynamics).law
+    if case.name == "kband":
+        transition = WithConstant(transition)
+    model = StateSpaceModel(case.prior, transition, case.observation)
+    return UnscentedParticleFilter(model, settings.particles) if name == "mf-upf" else UnscentedKalmanFilter(model)
+
+
+def _dynamics_of(name: str, dynamics: dict[str, Dynamics]) -> Dynamics:
+    return dynamics[NOMINAL if name == "nominal-ukf" else POTENTIAL]
+
+
+@torch.no_grad()
+def track(
+    name: str, case: Case, dynamics: dict[str, Dynamics], settings: GraceSettings, *, progress: bool = False
+) -> tuple[History, float]:
+    """Run one filter through the tracking hours; returns its history and milliseconds a step of one run."""
+    first, count = settings.training_steps, settings.tracking_steps
+    controls = _dynamics_of(name, dynamics).controls[first : first + count]
+    filt = make_filter(name, case, dynamics, settings)
+    begin = time.perf_counter()
+    history = filt(case.measurements, controls, settings.step_s, seed=settings.seed, progress=progress)
+    elapsed = time.perf_counter() - begin
+    return history, 1e3 * elapsed / (count * case.measurements.shape[1])
+
+
+def score(history: History, case: Case, settings: GraceSettings) -> dict[str, Any]:
+    """Errors against the precise orbits from the settled part on; JSON-ready.
+
+    Returns:
+        Root mean squares of 3-D position and velocity over time and runs, their standard deviation over runs, the same
+        by axis; ``nees`` of the six numbers (6 is ideal) with the share of epochs at which its mean over runs lies in
+        its 95 % chi-square band (runs share the dynamics' error and the K-band record, so a sound filter may leave the
+        band more often); ESS over particles; outages and bias for "kband".
+    """
+    settled = slice(settings.settle_steps, None)
+    plain = slice(0, case.runs)
+    error = history.mean[..., :6] - case.truth.unsqueeze(1)
+    covariance = history.covariance[..., :6, :6].expand(*error.shape, 6)
+    some, inside = error[settled, plain], covariance[settled, plain]
+    nees = _nees(some, inside)
+    low, high = chi_square_band(6, case.runs)
+    mean = nees.mean(1)
+    result: dict[str, Any] = {
+        "position_rmse_m": _rms(some[..., :3]),
+        "velocity_rmse_m_s": _rms(some[..., 3:]),
+        "position_rmse_sd_m": _spread(some[..., :3]),
+        "velocity_rmse_sd_m_s": _spread(some[..., 3:]),
+        "in_plane_rmse_m": _rms(some[..., :2]),
+        "axes_rmse_m": {axis: float(some[..., k].square().mean().sqrt()) for k, axis in enumerate(_AXES)},
+        "nees": float(nees.mean()),
+        "nees_band_95": [low, high],
+        "nees_inside_band": float(((mean >= low) & (mean <= high)).double().mean()),
+        "log_likelihood": float(history.diagnostics.log_likelihood[:, plain].sum(0).mean()),
+        "ess": None if history.diagnostics.ess is None else float(history.diagnostics.ess[settled, plain].mean()),
+    }
+    if case.name == "kband":
+        last = [rows.stop - 1 for rows in case.outages]
+        if last:
+            end = error[last, case.runs :]
+            result["outage_end"] = {
+                "position_rmse_m": _rms(end[..., :3]),
+                "velocity_rmse_m_s": _rms(end[..., 3:]),
+                "in_plane_rmse_m": _rms(end[..., :2]),
+                "nees": float(_nees(end, covariance[last, case.runs :]).mean()),
+            }
+        bias, variance = history.mean[-1, plain, 6], history.covariance[-1, plain, 6, 6]
+        result["bias"] = {"estimate_m": float(bias.mean()), "sd_m": float(variance.mean().sqrt())}
+    return result
+
+
+def bias_of_record(data: GraceData, settings: GraceSettings) -> float:
+    """Mean of K-band range minus the orbits' separation over the tracking hours, m."""
+    first, count = settings.training_steps, settings.tracking_steps
+    rows = slice(first + 1, first + 1 + count)
+    gap = data.range_m[rows] - torch.linalg.vector_norm(data.states[rows, :3], dim=-1)
+    return float(gap.nanmean())
+
+
+def chi_square_band(size: int, runs: int, level: float = 0.95) -> tuple[float, float]:
+    """Band of the mean NEES of ``runs`` independent runs with ``size`` numbers each."""
+    from scipy.stats import chi2
+
+    tail = (1 - level) / 2
+    low, high = (float(chi2.ppf(p, size * runs)) / runs for p in (tail, 1 - tail))
+    return low, high
+
+
+def _nees(error: Tensor, covariance: Tensor) -> Tensor:
+    return (error * torch.linalg.solve(covariance, error)).sum(-1)
+
+
+def _rms(error: Tensor) -> float:
+    return float(error.square().sum(-1).mean().sqrt())
+
+
+def _spread(error: Tensor) -> float:
+    """Standard deviation over runs of each run's root mean square."""
+    return float(error.square().sum(-1).mean(0).sqrt().std())
