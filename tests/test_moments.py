@@ -52,7 +52,7 @@ def integrate_2d(function, mean, root):
 def normal_moment(powers):
     """E of a monomial of independent standard normals."""
     odd = any(power % 2 for power in powers)
-    return 0.0 if odd else float(np.prod([math.prod(range(1, power, 2)) for power in powers]))
+    return 0.0 if odd else float(math.prod(math.prod(range(1, power, 2)) for power in powers))
 
 
 def rule_mean(rule, size, powers):

@@ -264,8 +264,8 @@ def test_attitude_filter_is_consistent_and_keeps_unit_norm(rule, attitude):
     """60 runs whose truth is drawn from the model, with two full turns and more.
 
     The mean over runs of e^T P^-1 e at the last step is a chi-squared of 360 degrees of freedom divided by 60: 5
-    deviations are allowed, 6 +- 5 sqrt(12 / 60) = 6 +- 2.2, with false alarms below 1e-6; likewise the innovations, where
-    linearisation adds up to 0.1.
+    deviations are allowed, 6 +- 5 sqrt(12 / 60) = 6 +- 2.2, with false alarms below 1e-6; likewise the innovations,
+    where linearisation adds up to 0.1.
     """
     model, truth, ys, rates, dt = attitude
     history = tf.GaussianFilter(model, RULES[rule])(ys, rates, dt)
