@@ -7,12 +7,11 @@ from typing import Any
 
 from torchfilt.history import History
 from torchfilt.missions.grace.data import build_data
-from torchfilt.missions.grace.learning import POTENTIAL, learn
+from torchfilt.missions.grace.learning import J2, PHASE, POTENTIAL, learn
 from torchfilt.missions.grace.prediction import gains, prediction_errors
 from torchfilt.missions.grace.settings import GraceSettings
 from torchfilt.missions.grace.tracking import (
     FILTERS,
-    NOMINAL,
     Case,
     CaseName,
     bias_of_record,
@@ -24,7 +23,7 @@ from torchfilt.missions.grace.tracking import (
 Say = Callable[[str], None]
 _CASES: tuple[CaseName, ...] = ("kband", "radar")
 # Learned dynamics beside the nominal law whose residual they hold.
-_GAINS = (("two-body", "two-body + phase GP"), ("J2", "J2 + phase GP"), (NOMINAL, POTENTIAL))
+_GAINS = (*PHASE.items(), (J2, POTENTIAL))
 
 
 def run(
@@ -56,7 +55,7 @@ def run(
     entries, growth = prediction_errors(data, dynamics, settings)
     prediction: dict[str, Any] = {
         **entries,
-        "gains": {learned: gains(entries, *pair) for pair in _GAINS for learned in pair[1:]},
+        "gains": {learned: gains(entries, nominal, learned) for nominal, learned in _GAINS},
     }
     _say_prediction(prediction, say)
     result: dict[str, Any] = {name: {} for name in FILTERS}
@@ -96,40 +95,44 @@ def _draw(folder: Path, settings: GraceSettings, growth: Any, cases: Any, record
 
 def _say_prediction(prediction: dict[str, Any], say: Say) -> None:
     say("")
-    say(f"{'prediction, held out':<22}{'one step':>24}{'z':>12}{'15 min':>10}{'94 min':>10}  median")
+    say(f"{'held-out hours':<20}{'one step, rms':>25}{'z':>12}{'15 min':>11}{'94 min':>11}  (median)")
     for name, entry in prediction.items():
         if name == "gains":
             continue
         position, velocity = entry["one_step"]["position_m"], entry["one_step"]["velocity_m_s"]
-        step = f"{position['rms']:.2e} m {velocity['rms']:.2e} m/s"
+        step = f"{position['rms']:.2g} m {velocity['rms']:.2g} m/s"
         honest = f"{position['z']:.2f} {velocity['z']:.2f}"
-        medians = "".join(f"{value:>8.3g} m" for value in entry["median_m"].values())
-        say(f"{name:<20}{step:>26}{honest:>12}{medians}")
-    for name, gain in prediction["gains"].items():
-        words = ", ".join(f"{key.replace('_', ' ')} {value:.1f}" for key, value in gain.items())
-        say(f"{name}, error of its nominal law over its own: {words}")
+        medians = "".join(f"{value:>9.3g} m" for value in entry["median_m"].values())
+        say(f"{name:<20}{step:>25}{honest:>12}{medians}")
+    say("z: error of one step over its predicted deviation, position and velocity; 1 is honest")
+    for nominal, name in _GAINS:
+        gain = prediction["gains"][name]
+        say(
+            f"{name}: errors smaller than those of {nominal} by a factor of {gain['one_step_velocity_m_s']:.1f} (one "
+            f"step, velocity), {gain['median_15_min']:.1f} (15 min), {gain['median_94_min']:.1f} (94 min)"
+        )
 
 
 def _say_tracking(result: dict[str, Any], recorded: float, say: Say) -> None:
-    for title, pick in (("K-band range + angles", None), ("simulated range + angles", "radar")):
+    for title, pick in (("K-band range, angles", None), ("simulated range, angles", "radar")):
         say("")
         say(
-            f"{title:<26}{'position':>10}{'(sd)':>8}{'velocity':>11}{'radial':>9}{'along':>8}{'across':>8}"
-            f"{'NEES':>7}{'ESS':>6}{'ms':>7}{'after outage':>14}"
+            f"{title:<24}{'position':>10}{'(sd)':>7}{'velocity':>14}{'radial':>8}{'along':>7}{'across':>8}"
+            f"{'NEES':>6}{'ESS':>5}{'ms':>7}{'' if pick else '  end of outage, in plane'}"
         )
         for name in FILTERS:
             own = result[name] if pick is None else result[name][pick]
             axes = own["axes_rmse_m"]
             ess = "-" if own["ess"] is None else f"{own['ess']:.0f}"
             outage = own.get("outage_end")
-            after = "" if outage is None else f"{outage['position_rmse_m']:.3g} m"
+            after = "" if outage is None else f"{outage['position_rmse_m']:>9.3g} m {outage['in_plane_rmse_m']:>9.3g} m"
             say(
-                f"{name:<26}{own['position_rmse_m']:>8.3g} m{own['position_rmse_sd_m']:>8.2g}"
-                f"{own['velocity_rmse_m_s']:>11.2e}{axes['radial']:>9.3g}{axes['along']:>8.2g}{axes['across']:>8.3g}"
-                f"{own['nees']:>7.2f}{ess:>6}{own['ms_per_step']:>7.2f}{after:>14}"
+                f"{name:<24}{own['position_rmse_m']:>8.3g} m{own['position_rmse_sd_m']:>7.2g}"
+                f"{own['velocity_rmse_m_s']:>10.2g} m/s{axes['radial']:>8.2g}{axes['along']:>7.2g}{axes['across']:>8.3g}"
+                f"{own['nees']:>6.1f}{ess:>5}{own['ms_per_step']:>7.2f}{after}"
             )
-        band = result["gp-ukf"]["nees_band_95"]
-        say(f"NEES: 6 is ideal, 95 % band of its mean over the runs at one epoch {band[0]:.1f} to {band[1]:.1f}")
+    band = result["gp-ukf"]["nees_band_95"]
+    say(f"NEES: 6 is ideal; 95 % band of its mean over the runs at one epoch {band[0]:.1f} to {band[1]:.1f}")
     bias = result["gp-ukf"]["bias"]
     say(
         f"bias of the K-band range: {recorded:.3f} m against the orbits; "

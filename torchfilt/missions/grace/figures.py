@@ -45,7 +45,7 @@ def _prediction(path: Path, growth: dict[str, Growth]) -> Path:
     figure, axes = new_axes(1, "prediction of the relative position in the held-out hours")
     ax: Axes = axes[0]
     for name, (minutes, error) in growth.items():
-        ax.loglog(minutes.numpy(), error.numpy(), "--" if "GP" not in name else "-", label=name)
+        ax.loglog(minutes.numpy(), error.numpy(), "-" if name.endswith("gp") else "--", label=name)
     ax.set_xlabel("time without measurements, min")
     ax.set_ylabel("median position error, m")
     ax.legend()

@@ -12,12 +12,12 @@ from torchfilt.io.grace import EARTH_RATE_RAD_S
 from torchfilt.missions.grace.data import MU_M3_S2, GraceData, nominal_law, residual
 from torchfilt.missions.grace.potential_gp import PotentialTransition, fit_potential
 from torchfilt.missions.grace.settings import GraceSettings
-from torchfilt.models.relative_motion import phase, to_curvilinear
+from torchfilt.models.relative_motion import TwoBody, phase, to_curvilinear
 
 Say = Callable[[str], None]
-# Phase GPs are trained by these names: point mass or flattened Earth as the nominal law.
-_PHASE = {"two-body": "two-body + phase GP", "J2": "J2 + phase GP"}
-POTENTIAL = "J2 + potential GP"
+POINT_MASS, J2, POTENTIAL = "two-body", "j2", "j2-potential-gp"
+# Nominal laws and the phase GPs that learn their residual.
+PHASE = {POINT_MASS: "two-body-phase-gp", J2: "j2-phase-gp"}
 
 
 class Dynamics(NamedTuple):
@@ -31,32 +31,23 @@ class Dynamics(NamedTuple):
 def learn(
     data: GraceData, settings: GraceSettings, *, out: str | Path | None = None, say: Say = lambda line: None
 ) -> dict[str, Dynamics]:
-    """Learn from the training hours.
-
-    Each law's process noise is a white acceleration of the size of its own one-step errors in those hours; the GPs'
-    uncertainty comes on top.
+    """Learn all laws from the training hours.
 
     Args:
         data: the whole day; only the training hours are used, but for the chief's orbit, which is known.
         settings: of the run.
         out: folder for the phase GPs' checkpoints and logs, or None.
-        say: receives a line for each law.
+        say: receives a line for each learned law.
 
     Returns:
-        Laws by name: the nominal "two-body" and "J2", each with a phase GP, and "J2 + potential GP".
+        Laws by name: nominal "two-body" and "j2", each with a phase GP on top, and "j2-potential-gp".
     """
-    result: dict[str, Dynamics] = {}
-    for name in _PHASE:
-        missed = residual(data, nominal_law(0.0, j2=name == "J2", step_s=settings.step_s), settings.step_s)
-        psd = float(missed[: settings.training_steps, 3:].square().mean()) / settings.step_s
-        law = nominal_law(psd, j2=name == "J2", step_s=settings.step_s)
-        result[name] = Dynamics(law, data.controls, {"psd_m2_s3": psd})
-    result[POTENTIAL] = _potential(data, settings)
+    result = nominal_dynamics(data, settings)
+    for nominal, name in PHASE.items():
+        result[name] = learn_phase(data, settings, nominal, None if out is None else Path(out) / name)
+        say(f"{name}: {_words(result[name].training)}")
+    result[POTENTIAL] = learn_potential(data, settings)
     say(f"{POTENTIAL}: {_words(result[POTENTIAL].training)}")
-    for name, learned in _PHASE.items():
-        folder = None if out is None else Path(out) / learned.replace(" + ", "_").replace(" ", "_").lower()
-        result[learned] = _phase(data, settings, name, folder)
-        say(f"{learned}: {_words(result[learned].training)}")
     return result
 
 
@@ -64,8 +55,21 @@ def _words(training: dict[str, Any]) -> str:
     return ", ".join(f"{key} {value:.4g}" for key, value in training.items() if isinstance(value, (int, float)))
 
 
-def _phase(data: GraceData, settings: GraceSettings, nominal: str, folder: Path | None) -> Dynamics:
-    """Structured kernel, affine in the state and periodic in the argument of latitude, trained by Lightning."""
+def nominal_dynamics(data: GraceData, settings: GraceSettings) -> dict[str, Dynamics]:
+    """The two nominal laws, each with a white acceleration of the size of its own one-step errors in training."""
+    result = {}
+    for name in PHASE:
+        missed = residual(data, _nominal(name, 0.0, settings), settings.step_s)[: settings.training_steps]
+        psd = float(missed[:, 3:].square().mean()) / settings.step_s
+        result[name] = Dynamics(_nominal(name, psd, settings), data.controls, {"psd_m2_s3": psd})
+    return result
+
+
+def learn_phase(data: GraceData, settings: GraceSettings, nominal: str, folder: Path | None = None) -> Dynamics:
+    """Residual of a nominal law by the structured kernel, affine in the state and periodic in the argument of latitude.
+
+    Trained by Lightning. Its noise is what it learned: the nominal law has none of its own here.
+    """
     from torchfilt.learning import train_transition
 
     count = settings.training_steps
@@ -73,8 +77,7 @@ def _phase(data: GraceData, settings: GraceSettings, nominal: str, folder: Path 
         data.states[:count],
         data.controls[:count],
         data.states[1 : count + 1],
-        # Beside the learned noise, no floor.
-        nominal_law(0.0, j2=nominal == "J2", step_s=settings.step_s),
+        _nominal(nominal, 0.0, settings),
         dt=settings.step_s,
         context=phase,
         kernel="structured",
@@ -86,26 +89,28 @@ def _phase(data: GraceData, settings: GraceSettings, nominal: str, folder: Path 
     return Dynamics(law, data.controls, training)
 
 
-def _potential(data: GraceData, settings: GraceSettings) -> Dynamics:
-    """Kernel of a random potential outside the Earth."""
+def learn_potential(data: GraceData, settings: GraceSettings) -> Dynamics:
+    """Residual of J2 motion by the kernel of a random potential outside the Earth."""
     begin = time.perf_counter()
     count = settings.training_steps
     rows = slice(0, count * settings.stride + 1)
-    chief = data.chief.rows(rows)
-    missed = residual(data, nominal_law(0.0, j2=True, step_s=settings.step_s), settings.step_s)
+    chief, relative = data.chief.rows(rows), data.relative[rows]
     radius = torch.linalg.vector_norm(chief.position_m, dim=-1)
-    place = to_curvilinear(data.relative[rows], radius)[:, :3].mean(0)
     gp, fit = fit_potential(
         chief,
-        data.relative[rows],
-        missed[:count],
+        relative,
+        residual(data, _nominal(J2, 0.0, settings), settings.step_s)[:count],
         stride=settings.stride,
         degree=settings.degree,
         mu_m3_s2=MU_M3_S2,
         earth_rate_rad_s=EARTH_RATE_RAD_S,
-        reference_m=place,
+        reference_m=to_curvilinear(relative, radius)[:, :3].mean(0),
     )
     controls = gp.controls(data.chief, stride=settings.stride)
-    law = PotentialTransition(nominal_law(fit.psd_m2_s3, j2=True, step_s=settings.step_s), settings.step_s)
+    law = PotentialTransition(_nominal(J2, fit.psd_m2_s3, settings), settings.step_s)
     training = {**fit._asdict(), "degree": gp.degree, "samples": count, "seconds": time.perf_counter() - begin}
     return Dynamics(law, controls, training)
+
+
+def _nominal(name: str, psd_m2_s3: float, settings: GraceSettings) -> TwoBody:
+    return nominal_law(psd_m2_s3, j2=name == J2, step_s=settings.step_s)

@@ -11,7 +11,7 @@ from torchfilt.filters.particle import UnscentedParticleFilter
 from torchfilt.gaussian import Gaussian
 from torchfilt.history import History
 from torchfilt.missions.grace.data import GraceData
-from torchfilt.missions.grace.learning import POTENTIAL, Dynamics
+from torchfilt.missions.grace.learning import J2, POTENTIAL, Dynamics
 from torchfilt.missions.grace.settings import GraceSettings
 from torchfilt.model import StateSpaceModel
 from torchfilt.models.relative_motion import BiasedRanging, RendezvousRadar, WithConstant
@@ -19,7 +19,6 @@ from torchfilt.noise import NoiseSource
 from torchfilt.run import Filter
 
 FILTERS = ("nominal-ukf", "gp-ukf", "mf-upf")
-NOMINAL = "J2"
 CaseName = Literal["kband", "radar"]
 # Purposes of random numbers, keys of the noise source.
 _PRIOR, _ANGLES, _RANGE = 0, 1, 2
@@ -47,8 +46,8 @@ def simulate_case(data: GraceData, settings: GraceSettings, name: CaseName) -> C
     """Measurements of all runs through the tracking hours.
 
     Angles are simulated: of the true positions, with noise, in the true chief's axes; the filters take the chief's mean
-    radius instead, which turns the axes by up to 5e-5 rad. Runs differ by the noise of angles (and simulated range) and
-    by the prior's error; the K-band record is one.
+    radius instead, which turns the axes by up to 6e-5 rad (a fifth of the default noise). Runs differ by the noise of
+    angles (and simulated range) and by the prior's error; the K-band record is one.
     """
     first, count, runs = settings.training_steps, settings.tracking_steps, settings.runs
     truth = data.states[first + 1 : first + 1 + count]
@@ -102,7 +101,7 @@ def make_filter(name: str, case: Case, dynamics: dict[str, Dynamics], settings: 
 
 
 def _dynamics_of(name: str, dynamics: dict[str, Dynamics]) -> Dynamics:
-    return dynamics[NOMINAL if name == "nominal-ukf" else POTENTIAL]
+    return dynamics[J2 if name == "nominal-ukf" else POTENTIAL]
 
 
 @torch.no_grad()
