@@ -21,8 +21,9 @@ Step = Tensor | float | None
 class Filter(nn.Module, Generic[B]):
     """A filter is `init` and `advance`; streaming, whole series, checks and records are the same for all.
 
-    Index convention: the prior is the state before the first measurement; each step moves it over dt and then takes the
-    measurement in. ``dt = 0`` means no motion; where laws know no dt, ``predict_first=False`` says it for the first step.
+    Index convention: the prior is the state before the first measurement; each step moves it over dt and then takes
+    the measurement in. ``dt = 0`` means no motion; where laws know no dt, ``predict_first=False`` says it for the first
+    step.
 
     Attributes:
         model: the three laws.
@@ -96,10 +97,16 @@ class Filter(nn.Module, Generic[B]):
             State after the measurement, and the report.
 
         Raises:
-            FilterError: a row failed (``throw``). TypeError, ValueError: dtype, shape, Inf in y.
+            FilterError: a row failed (``throw``). TypeError, ValueError: as in `forward`.
         """
-        _check_measurements(y, state.belief, "y")
+        batch = _batch_of(state.belief)
+        _check_measurements(y, state.belief, "y", y.shape[:-1])
+        if u is not None:
+            _check_controls(u, y, "u", u.shape[:-1], batch)
+        _check_step(dt)
         if isinstance(dt, Tensor):
+            if dt.dim() and dt.shape != batch:
+                raise ValueError(f"dt must be a number or {tuple(batch)}, got {tuple(dt.shape)}")
             dt = dt.unsqueeze(-1)
         missing = _missing_of(y)
         noise = self.draw(state.belief, state.step, state.seed)
@@ -145,8 +152,14 @@ class Filter(nn.Module, Generic[B]):
             raise ValueError(f"measurements must be (t, *batch, m) with t >= 1, got {tuple(measurements.shape)}")
         if state is None:
             state = self.init(tuple(measurements.shape[1:-1]), seed)
-        _check_measurements(measurements, state.belief, "measurements")
-        _check_controls(controls, measurements)
+        _check_measurements(measurements, state.belief, "measurements", measurements.shape[1:-1])
+        if controls is not None:
+            if controls.dim() < 2 or len(controls) != len(measurements):
+                raise ValueError(
+                    f"controls must be (t, k) or (t, *batch, k) with t = {len(measurements)}, "
+                    f"got {tuple(controls.shape)}"
+                )
+            _check_controls(controls, measurements, "controls", controls.shape[1:-1], measurements.shape[1:-1])
         steps = _time_steps(dt, measurements)
         missing = _missing_by_step(measurements)
         recorder = Recorder(record, self.evidence)
@@ -156,55 +169,66 @@ class Filter(nn.Module, Generic[B]):
             u = None if controls is None else controls[k]
             predict = predict_first or k > 0
             belief, info = self.advance(belief, measurements[k], u, steps[k], noise, missing[k], predict)
+            del noise  # its memory serves the next draw
             recorder.add(belief, info)
         history = recorder.finish(FilterState(belief, start + len(measurements), state.seed))
         if throw and not bool(history.diagnostics.ok.all()):
-            first = (
-                int((~history.diagnostics.ok).flatten(1).any(1).nonzero()[0])
-                if measurements.dim() > 2
-                else int((~history.diagnostics.ok).nonzero()[0])
-            )
+            failed = ~history.diagnostics.ok
+            first = int(failed.reshape(len(failed), -1).any(1).nonzero()[0])
             raise FilterError(_failure(history.diagnostics.ok[first], start + first, measurements[first]))
         return history
 
 
-def _check_measurements(y: Tensor, belief: Gaussian | Particles, name: str) -> None:
-    """Dtype as the model's, no infinities."""
+def _batch_of(belief: Gaussian | Particles) -> torch.Size:
+    return belief.mean.shape[:-1] if isinstance(belief, Gaussian) else belief.x.shape[:-2]
+
+
+def _check_measurements(y: Tensor, belief: Gaussian | Particles, name: str, batch: torch.Size) -> None:
+    """Dtype and batch as the belief's, no infinities."""
     like = belief.mean if isinstance(belief, Gaussian) else belief.x
     if y.dtype != like.dtype:
         raise TypeError(f"{name} must have the model's dtype {like.dtype}, got {y.dtype}")
-    infinite = torch.isinf(y.detach())
-    if infinite.any():
-        where = tuple(infinite.nonzero()[0].tolist())
-        raise ValueError(f"{name} must be finite or NaN (not measured), entry {where} is {y.detach()[where].item()}")
-
-
-def _check_controls(controls: Tensor | None, measurements: Tensor) -> None:
-    if controls is None:
-        return
-    if controls.dim() < 2 or len(controls) != len(measurements):
+    if batch != _batch_of(belief):
+        axes = "(*batch, m)" if y.dim() == len(batch) + 1 else "(t, *batch, m)"
         raise ValueError(
-            f"controls must be (t, k) or (t, *batch, k) with t = {len(measurements)}, got {tuple(controls.shape)}"
+            f"{name} must be {axes} with the state's *batch = {tuple(_batch_of(belief))}, got {tuple(y.shape)}"
         )
-    bad = ~torch.isfinite(controls.detach())
+    _refuse(y, torch.isinf(y.detach()), f"{name} must be finite or NaN (not measured)")
+
+
+def _check_controls(u: Tensor, y: Tensor, name: str, own: torch.Size, batch: torch.Size) -> None:
+    """Dtype as the measurements', shared by the batch or one a row, finite."""
+    if u.dtype != y.dtype:
+        raise TypeError(f"{name} must have the model's dtype {y.dtype}, got {u.dtype}")
+    if own not in ((), batch):
+        raise ValueError(f"{name} must be shared by the *batch {tuple(batch)} or one a row, got {tuple(u.shape)}")
+    _refuse(u, ~torch.isfinite(u.detach()), f"{name} must be finite")
+
+
+def _check_step(dt: Step) -> None:
+    """Finite and not negative."""
+    if isinstance(dt, Tensor):
+        _refuse(dt, ~(torch.isfinite(dt.detach()) & (dt.detach() >= 0)), "dt must be finite and >= 0")
+    elif dt is not None and not 0 <= dt < float("inf"):
+        raise ValueError(f"dt must be finite and >= 0, got {dt}")
+
+
+def _refuse(values: Tensor, bad: Tensor, rule: str) -> None:
+    """Raise with the rule and the first bad entry."""
     if bad.any():
         where = tuple(bad.nonzero()[0].tolist())
-        raise ValueError(f"controls must be finite, entry {where} is {controls.detach()[where].item()}")
+        raise ValueError(f"{rule}, entry {where} is {values.detach()[where].item()}")
 
 
 def _time_steps(dt: Step, measurements: Tensor) -> list[Any]:
     """One entry a step: number, (*batch, 1) or None."""
     count = len(measurements)
-    if dt is None or not isinstance(dt, Tensor):
-        if dt is not None and not 0 <= dt < float("inf"):
-            raise ValueError(f"dt must be finite and >= 0, got {dt}")
+    if not isinstance(dt, Tensor):
+        _check_step(dt)
         return [dt] * count
     if dt.shape not in ((count,), measurements.shape[:-1]):
         raise ValueError(f"dt must be a number, ({count},) or {tuple(measurements.shape[:-1])}, got {tuple(dt.shape)}")
-    bad = ~(torch.isfinite(dt.detach()) & (dt.detach() >= 0))
-    if bad.any():
-        where = tuple(bad.nonzero()[0].tolist())
-        raise ValueError(f"dt must be finite and >= 0, entry {where} is {dt.detach()[where].item()}")
+    _check_step(dt)
     if dt.dim() == 1 and not dt.requires_grad:
         return list(dt.tolist())  # plain numbers let laws use what they hold for their usual step
     return list(dt.unsqueeze(-1))
@@ -232,7 +256,7 @@ def _missing_by_step(measurements: Tensor) -> list[Missing]:
 def _failure(ok: Tensor, step: int, y: Tensor) -> str:
     rows = (~ok).nonzero().tolist() if ok.dim() else [[]]
     shown = [tuple(row) for row in rows[:5]]
-    values = [y[row].tolist() for row in shown] if y.dim() > 1 else [y.tolist()]
+    values = [y[row].tolist() for row in shown] if ok.dim() else y.tolist()
     more = "" if len(rows) <= 5 else f" and {len(rows) - 5} more"
     where = f"rows {shown}{more}" if ok.dim() else "the only row"
     return (

@@ -44,8 +44,15 @@ class GaussianFilter(Filter[Gaussian]):
         self.evidence = "exact" if model.is_linear() else "linearized"
 
     def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[Gaussian]:
-        """The prior's moments, the mean expanded to (*batch, d); ``seed`` is carried along unused."""
+        """The prior's moments, the mean expanded to (*batch, d); ``seed`` is carried along unused.
+
+        Raises:
+            ValueError: the prior has a batch of its own, which is another one.
+        """
         prior = self.model.prior()
+        lead = prior.mean.shape[:-1]
+        if lead and lead != torch.Size(batch_shape):
+            raise ValueError(f"the prior is for a batch of {tuple(lead)}, not {tuple(batch_shape)}")
         mean = prior.mean.expand(*batch_shape, prior.mean.shape[-1])
         return FilterState(Gaussian(mean, prior.factor(), prior.space), 0, seed)
 
