@@ -189,3 +189,46 @@ def test_sparse_refusals():
         SparseGPRegression(x, outputs(x, phase), phase, kernel="structured")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="between 1 and the 8"):
         SparseGPRegression(x, outputs(x, phase), phase, inducing=9)
+
+
+@pytest.mark.parametrize("kernel", ["structured", "ard"])
+@pytest.mark.parametrize("shared", [False, True])
+def test_groups_are_left_out_together(make, kernel, shared):
+    """Each group against a regression that never had it, in extended precision."""
+    regression = make(kernel, shared, count=20)
+    groups = torch.tensor([3, 0, 0, 7] * 5)
+    error, variance = regression.left_out(groups)
+    y = regression.standardized()[1].numpy()
+    noise = regression.likelihood.noise.detach().flatten().expand(P).numpy()
+    for i in range(P):
+        prior = prior_of(regression, i)
+        for name in (0, 3, 7):
+            out = (groups == name).numpy()
+            cross, own = prior[np.ix_(~out, out)], np.diag(prior)[out]
+            mean, latent = gp_oracle.posterior(prior[np.ix_(~out, ~out)], cross, own, y[~out, i], noise[i])
+            # The precision form loses digits by the condition of kernel + noise, about 1e6 to 1e7 here.
+            np.testing.assert_allclose(error[out, i], y[out, i] - mean, rtol=1e-7, atol=1e-8)
+            np.testing.assert_allclose(variance[out, i], latent + noise[i], rtol=1e-7)
+    single = regression.left_out(torch.arange(20))
+    for got, expected in zip(single, regression.left_out(), strict=True):
+        assert torch.equal(got, expected)
+    factors = regression.calibrate(groups)
+    ratio = (error.square() / variance).mean(0)
+    expected = ratio.mean() if shared else ratio
+    torch.testing.assert_close(factors, expected.clamp_min(1.0).expand_as(factors))
+
+
+def test_left_out_needs_no_definite_kernel_matrix():
+    """Where noise is lost in the rounding of the kernel matrix, the weight-space form keeps it."""
+    x, phase = queries(200, seed=2)
+    regression = GPRegression(x, outputs(x, phase), phase, noise_floor=1e-8)
+    regression.likelihood.noise = 1e-14
+    regression.kernel.lengthscale = 10.0
+    regression.kernel.deviation = 300.0 * torch.ones_like(regression.kernel.deviation)
+    with pytest.raises(ValueError, match="not positive definite"):
+        regression._checked_factor(regression.standardized()[0])
+    error, variance = regression.left_out()
+    assert torch.isfinite(error).all() and (variance > 0).all()
+    frozen = regression.freeze()
+    q, f = queries(50, seed=6)
+    assert (frozen.mean(q, f) - outputs(q, f)).abs().max() < 1e-2

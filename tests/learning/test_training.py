@@ -2,6 +2,7 @@
 
 import json
 import logging
+import signal
 import subprocess
 import sys
 
@@ -189,3 +190,48 @@ def test_package_import_is_light():
         "assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_law_in_another_precision_counts_its_rounding(data):
+    """A float32 law of states around 1000 errs by their rounding, far above what was learned; its noise says so."""
+    x, u, x_next = data
+    far = (x + 1000.0, u, x_next + 1000.0)
+    exact, _ = train_transition(*far, **OPTIONS, nominal=None)
+    law, _ = train_transition(*far, **OPTIONS, nominal=None, dtype=torch.float32)
+    assert law.gp.noise.dtype == torch.float32
+    test_x, test_u, _ = pairs(300, seed=1, noise=0.0)
+    error = law((test_x + 1000.0).float(), test_u, 1.0).mean.double() - exact(test_x + 1000.0, test_u, 1.0).mean
+    added = (law.gp.noise.double() - exact.gp.noise).sqrt()
+    assert (added > 1e-5).all()  # 2^-24 of 1000, uniform, for the state and again for the step
+    torch.testing.assert_close(added, error.square().mean(0).sqrt(), rtol=0.35, atol=0)
+    again, _ = train_transition(*far, **OPTIONS, nominal=None, dtype=torch.float64)
+    assert torch.equal(again.gp.noise, exact.gp.noise)
+
+
+def test_groups_reach_the_calibration(data):
+    x, u, x_next = (t.repeat_interleave(2, 0) for t in data)  # each sample twice: its twin tells all but the noise
+    alone = train_transition(x, u, x_next, **OPTIONS, epochs=3)[1]
+    together = train_transition(x, u, x_next, **OPTIONS, epochs=3, groups=torch.arange(60).repeat_interleave(2))[1]
+    assert max(together.inflation) > max(alone.inflation)
+
+
+def test_sigterm_ends_an_epoch_and_is_resumed(tmp_path, data):
+    """Lightning answers SIGTERM by leaving the process; with ``stop`` given the fit ends in good order instead."""
+    received = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: received.append(number))
+    calls = []
+
+    def stop():
+        calls.append(1)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGTERM)
+        return bool(received)
+
+    try:
+        _, report = run(tmp_path / "parts", data, epochs=5, stop=stop, **SPARSE)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert received == [signal.SIGTERM] and report.interrupted
+    whole, _ = run(tmp_path / "whole", data, epochs=5, **SPARSE)
+    resumed, _ = run(tmp_path / "parts", data, epochs=5, resume=True, **SPARSE)
+    assert torch.equal(whole.gp.posterior.alpha, resumed.gp.posterior.alpha)
