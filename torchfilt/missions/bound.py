@@ -64,5 +64,5 @@ def _jacobian(law: Callable[..., Gaussian], at_x: Gaussian, x: Tensor, *argument
         result = law(x.unsqueeze(-2) + error, *lifted)
         return at_x.space.local(at_x.mean.unsqueeze(-2), result.mean)
 
-    _, columns = torch.func.jvp(response, (torch.zeros_like(directions),), (directions,))
+    columns: Tensor = torch.func.jvp(response, (torch.zeros_like(directions),), (directions,))[1]
     return columns.mT

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from torchfilt.learning.figures import save_figure
-from torchfilt.missions.formation import Scene, StudySettings
+from torchfilt.missions.formation.scene import Scene, StudySettings
 from torchfilt.missions.stages import Arrays
 
 if TYPE_CHECKING:
@@ -31,7 +31,13 @@ def new_figure(rows: int, columns: int, size: tuple[float, float], title: str = 
 
 
 def plot_error_band(
-    time_h: Array, error: Array, deviation: Array, label: str, ax: "Axes", colour: str = COLOURS[0], limit: float | None = None
+    time_h: Array,
+    error: Array,
+    deviation: Array,
+    label: str,
+    ax: "Axes",
+    colour: str = COLOURS[0],
+    limit: float | None = None,
 ) -> "Axes":
     """One coordinate's error with the claimed +-3 sigma band.
 
@@ -57,13 +63,14 @@ def plot_error_norms(
         time_h: (t,). errors: name -> (t, R, k), drawn as the root mean square over runs and over ``window`` epochs.
         bound: (t,) root of the trace of a bound. label: of the y axis.
     """
-    for colour, (name, error) in zip(COLOURS, errors.items(), strict=False):
+    for k, (colour, (name, error)) in enumerate(zip(COLOURS, errors.items(), strict=False)):
         square = np.mean(np.sum(error**2, -1), 1)
         kernel = np.ones(window)
         smooth = np.convolve(square, kernel, "same") / np.convolve(np.ones_like(square), kernel, "same")
-        ax.semilogy(time_h, np.sqrt(smooth), lw=1.2, color=colour, label=name)
+        # Filters of equal accuracy lie on each other: later ones are thinner, so that earlier ones show beside them.
+        ax.semilogy(time_h, np.sqrt(smooth), lw=max(1.0, 2.2 - 0.2 * k), color=colour, label=name)
     if bound is not None:
-        ax.semilogy(time_h, bound, lw=1.2, ls="--", color="0.35", label="Cramér-Rao bound")
+        ax.semilogy(time_h, bound, lw=1.4, ls=(0, (2, 1.5)), color="0.35", label="Cramér-Rao bound", zorder=9)
     ax.set_ylabel(label)
     ax.set_xlim(time_h[0], time_h[-1])
     ax.grid(alpha=0.25, lw=0.5)
@@ -79,9 +86,15 @@ def plot_path(
     for colour, (name, path) in zip(COLOURS, estimates.items(), strict=False):
         ax.plot(path[:, first], path[:, second], lw=0.8, color=colour, label=name)
     ax.plot(*truth[0, [first, second]], "o", ms=5, color="0.2", label="start")
+    # A square window around the truth: a filter that lost its satellite must not shrink the picture to a point.
+    low, high = truth.min(0), truth.max(0)
+    half = 0.58 * max((high - low)[[first, second]].max(), 1.0)
+    for index, limit in ((first, ax.set_xlim), (second, ax.set_ylim)):
+        middle = (low[index] + high[index]) / 2
+        limit(middle - half, middle + half)
     ax.set_xlabel(f"{names[first]}, m")
     ax.set_ylabel(f"{names[second]}, m")
-    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_aspect("equal")
     ax.grid(alpha=0.25, lw=0.5)
     return ax
 
@@ -122,7 +135,7 @@ def _hours(scene: Scene) -> tuple[Array, float]:
 
 def _path_figure(results: dict[str, Arrays], scene: Scene, title: str) -> Any:
     """Three projections of the first run and, because errors are far below the line's width there, a closer look."""
-    shown = [name for name in ("mf-upf", "cw-pf", "exact-ukf") if name in results] or list(results)[:2]
+    shown = [name for name in ("mf-upf", "cw-pf") if name in results] or list(results)[:2]
     truth = scene.truth.numpy()[:, :3]
     estimates = {name: truth + results[name]["error"][:, 0, :3] for name in shown}
     figure, axes = new_figure(2, 2, (9, 8.4), f"Deputy's path in the chief's Hill frame, run 1 ({title})")
@@ -137,7 +150,7 @@ def _path_figure(results: dict[str, Arrays], scene: Scene, title: str) -> Any:
     for colour, path in zip(COLOURS, near.values(), strict=False):
         close.plot(path[:, 1], path[:, 0], ".-", lw=0.8, ms=5, color=colour)
     span = 1.3 * np.median([np.abs(path[:, 0]).max() for path in near.values()])
-    close.set_title(f"close-up at {scene.time_s[rows][len(truth[rows]) // 2] / 3600:.2f} h", fontsize=10)
+    close.set_title(f"x over y, close up at {scene.time_s[rows][len(truth[rows]) // 2] / 3600:.2f} h", fontsize=10)
     close.set_xlabel("y, m from there")
     close.set_ylabel("x, m from there")
     close.set_ylim(-max(span, 0.2), max(span, 0.2))
@@ -164,10 +177,10 @@ def _comparison(results: dict[str, Arrays], scene: Scene, bound: Tensor, title: 
 
 
 def _bands(name: str, result: Arrays, scene: Scene, title: str) -> Any:
-    """Six coordinates of the first run; the axes leave out the transient of the first 1000 s."""
+    """Six coordinates of the first run; the scale is that of the time after the transient."""
     time, period = _hours(scene)
     figure, axes = new_figure(3, 2, (10, 7), f"{name}: error of run 1 and claimed ±3 sigma ({title})", sharex=True)
-    late = scene.time_s.numpy() > 1000 if scene.time_s[-1] > 1500 else np.ones(len(time), bool)
+    late = time > 0.4 * min(period, time[-1])
     for k, axis in enumerate("xyz"):
         for column, unit in ((0, "m"), (1, "m/s")):
             ax, index = axes[k, column], k + 3 * column

@@ -1,7 +1,7 @@
-"""Motion of the deputy under everything the truth has (J2, J3, J4, drag), as a law on batches: the filters' upper bound.
+"""Motion of the deputy under everything the truth has (J2, J3, J4, drag), as a law on batches: what filters can reach.
 
-The difference of the two orbits is integrated, as in `truth`, so that a step keeps its digits; the chief's own motion is
-interpolated from the control and computed once a control, not once a particle.
+The difference of the two orbits is integrated, as in `truth`, so that a step keeps its digits; the chief's own motion
+is interpolated from the control and computed once a control, not once a particle.
 """
 
 import torch
@@ -56,7 +56,9 @@ class ExactFormation(nn.Module):
             node = round(2 * self.steps * fraction)
             position, velocity, pull, thrust = (part[..., node, :] for part in chief)
             separation, relative_velocity = state.split(3, -1)
-            far = perturbation(position + separation, velocity + relative_velocity, _deputy_drag(self.settings), self.settings)
+            far = perturbation(
+                position + separation, velocity + relative_velocity, _deputy_drag(self.settings), self.settings
+            )
             change = central_difference(separation, position, self.settings.mu_m3_s2) + (far - pull) + thrust
             return torch.cat([relative_velocity, change], -1)
 
@@ -68,7 +70,9 @@ class ExactFormation(nn.Module):
         return Gaussian(mean, white_acceleration_factor(self.acceleration_psd_m2_s3, dt, control.end_frame_rate_rad_s))
 
 
-def perturbation(position_m: Tensor, velocity_m_s: Tensor, ballistic_m2_kg: float, settings: FormationSettings) -> Tensor:
+def perturbation(
+    position_m: Tensor, velocity_m_s: Tensor, ballistic_m2_kg: float, settings: FormationSettings
+) -> Tensor:
     """Acceleration (..., 3) by J2, J3, J4 and drag, inertial axes with z along the pole, m/s^2.
 
     Args:

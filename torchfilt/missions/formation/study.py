@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchfilt.gp.frozen import FrozenGP
-from torchfilt.missions.formation import (
+from torchfilt.missions.formation.scene import (
     CASES,
     FILTERS,
     LEARNED,
@@ -42,14 +42,19 @@ def run_filter(
         name: one of `FILTERS`. scene, settings, gp: see `make_filter`. progress: show a bar.
 
     Returns:
-        error (t, R, 6) estimate minus truth; deviation (t, R, 6) claimed; nees (t, R); ess (t, R), NaN without particles;
-        ok (t, R); cpu_s, of all runs and steps together.
+        error (t, R, 6) estimate minus truth; deviation (t, R, 6) claimed; nees (t, R); ess (t, R), NaN without
+        particles; ok (t, R); cpu_s, of all runs and steps together.
     """
     tracker = make_filter(name, scene, settings, gp)
     begin = time.process_time()
     with torch.no_grad():
         history = tracker(
-            scene.measurements, scene.controls, scene.formation.step_s, seed=settings.seed, throw=False, progress=progress
+            scene.measurements,
+            scene.controls,
+            scene.formation.step_s,
+            seed=settings.seed,
+            throw=False,
+            progress=progress,
         )
     seconds = time.process_time() - begin
     error, covariance = history.mean - scene.truth.unsqueeze(1), history.covariance
@@ -78,9 +83,9 @@ def summarize(result: Arrays, scene: Scene) -> dict[str, dict[str, Any]]:
 
     Returns:
         For each revolution: position_rmse_m and velocity_rmse_m_s, the median over runs of the 3-D RMSE of a run, with
-        its quartiles, its worst run and the root mean square over all runs (which a bound speaks of); nees, its mean, with
-        the 95 % band of a mean over the runs and the share of epochs inside it; ess; ms_per_step, CPU time of a step of
-        one run; lost, the number of runs above `LOST_M`. None where a number does not exist.
+        its quartiles, its worst run and the root mean square over all runs (which a bound speaks of); nees, its mean,
+        with the 95 % band of a mean over the runs and the share of epochs inside it; ess; ms_per_step, CPU time of a
+        step of one run; lost, the number of runs above `LOST_M`. None where a number does not exist.
     """
     summary = {}
     runs = result["error"].shape[1]
@@ -132,8 +137,8 @@ def nees_band(runs: int, size: int = 6, level: float = 0.95) -> tuple[float, flo
 def leakage(result: Arrays, exact: Arrays, rows: np.ndarray, least: float = 0.95) -> bool:
     """Whether errors are smaller than the exact model's by more than chance: learned dynamics then hold the answers.
 
-    Runs are paired (same measurements): log ratios of position and of velocity RMSE are averaged over the runs, and three
-    standard errors of that mean (one-sided false-alarm rate 0.1 % for many runs) are the noise.
+    Runs are paired (same measurements): log ratios of position and of velocity RMSE are averaged over the runs, and
+    three standard errors of that mean (one-sided false-alarm rate 0.1 % for many runs) are the noise.
 
     Args:
         result, exact: of `run_filter` on the same scene. rows: epochs (t,), bool. least: smallest honest ratio.
@@ -196,9 +201,13 @@ def run_formation(
         kept = known is not None and known.is_file()
         results[name] = stages.get(name, recipe, lambda name=name: run_filter(name, scene, settings, gp, progress))  # type: ignore[misc]
         summary["paper"][name] = summarize(results[name], scene)
-        say(f"{name:18s} {'as before' if kept else f'{float(results[name]['cpu_s']):.1f} s of CPU'}")
+        say(f"{name:18s} " + ("as before" if kept else f"{float(results[name]['cpu_s']):.1f} s of CPU"))
     summary["leakage"] = _leaks(results, scene)
-    summary |= {"settings": settings.to_dict(), "seeds": [settings.seed, settings.training_seed], "versions": versions()}
+    summary |= {
+        "settings": settings.to_dict(),
+        "seeds": [settings.seed, settings.training_seed],
+        "versions": versions(),
+    }
     for line in table(summary):
         say(line)
     if not summary["interrupted"]:
@@ -252,7 +261,7 @@ def _gp_stage(
             return gp, gp.settings["report"]
         except IntegrityError as error:
             say(f"{error}; trained again")
-    gp, report = train_gp(settings, progress=progress)
+    gp, report = train_gp(settings, progress=None if progress else False)  # None: on a terminal only
     gp.settings["report"] = report
     if path is not None:
         gp.save(path)
@@ -278,13 +287,16 @@ def table(summary: dict[str, Any]) -> list[str]:
         lines += [
             "",
             f"{revolution}: 3-D RMSE, median of the runs [quartiles]; NEES of a consistent filter is 6",
-            f"{'filter':18s} {'position, m':>25s} {'velocity, m/s':>31s} {'NEES':>9s} {'ESS':>7s} {'ms/step':>8s} {'lost':>5s}",
+            f"{'filter':18s} {'position, m':>25s} {'velocity, m/s':>31s} "
+            f"{'NEES':>9s} {'ESS':>7s} {'ms/step':>8s} {'lost':>5s}",
         ]
         for name, entries in summary["paper"].items():
             e = entries[revolution]
             position = _spread(e["position_rmse_m"], e["position_rmse_quartiles_m"], ".4f")
             velocity = _spread(e["velocity_rmse_m_s"], e["velocity_rmse_quartiles_m_s"], ".2e")
-            numbers = f"{_number(e['nees'], '.3g'):>9s} {_number(e['ess'], '.1f'):>7s} {_number(e['ms_per_step'], '.2f'):>8s}"
+            numbers = (
+                f"{_number(e['nees'], '.3g'):>9s} {_number(e['ess'], '.1f'):>7s} {_number(e['ms_per_step'], '.2f'):>8s}"
+            )
             lines.append(f"{name:18s} {position:>25s} {velocity:>31s} {numbers} {e['lost']:5d}")
         lines.append(f"{'Cramér-Rao bound':18s} {bound['position_rmse_m']:25.4f} {bound['velocity_rmse_m_s']:31.2e}")
     leaks = [name for name, leaks in summary["leakage"].items() if leaks]

@@ -18,9 +18,9 @@ Step = Tensor | float | None
 class EquationSeven:
     """Carried covariances P_i, draws from all of N(x_i+, P_i+), weights p(y|x) p(x|x_i) / N(x; x_i+, P_i+).
 
-    The draw spreads over P_i, which holds the uncertainty of the start, and the transition density p(x|x_i) is as narrow
-    as one step's process noise: almost no draw lies where its own ancestor can have gone, all weight falls on one
-    particle, and what it says is chance. `torchfilt.proposals.Local` puts the same kernel into both densities.
+    The draw spreads over P_i, which holds the uncertainty of the start, and the transition density p(x|x_i) is as
+    narrow as one step's process noise: almost no draw lies where its own ancestor can have gone, all weight falls on
+    one particle, and what it says is chance. `torchfilt.proposals.Local` puts the same kernel into both densities.
 
     Args:
         rule: moment rule of each particle.
