@@ -249,7 +249,10 @@ class Local:
             return predicted, predicted
         law = model.conditional("transition", particles.x, u, dt)
         step = as_gaussian(law)
-        return step._replace(scale_tril=step.factor(), is_diagonal=False), law
+        factor = step.factor()
+        if factor.dim() == 2:  # shared by everyone: what particles carry has a row and a particle axis
+            factor = factor.expand(*particles.x.shape[:-2], 1, -1, -1)
+        return step._replace(scale_tril=factor, is_diagonal=False), law
 
 
 def _equal_weights(x: Tensor, factor: Tensor | None, space: Space) -> Particles:
