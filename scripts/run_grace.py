@@ -85,10 +85,9 @@ def build_parser() -> ArgumentParser:
     )
     group.add_argument(
         "--outage-starts-h",
-        default=[2.0, 4.5],
-        type=list[float],
+        type=list[float] | None,
         metavar="[H,...]",
-        help="hours after the start of tracking at which they begin",
+        help="hours after the start of tracking at which they begin; a third and three quarters of it",
     )
     group.add_argument(
         "--settle-minutes", default=94.0, type=float, metavar="MIN", help="first part that no error is counted in"
@@ -124,7 +123,8 @@ def main(arguments: list[str] | None = None) -> int:
     from torchfilt.storage import atomic_write
 
     try:
-        settings = GraceSettings(**{**options, "outage_starts_h": tuple(options["outage_starts_h"])})
+        starts = options.pop("outage_starts_h")
+        settings = GraceSettings(**options, outage_starts_h=None if starts is None else tuple(starts))
     except ValueError as error:
         return _fail(error, debug, EXIT_USAGE)
     if threads is not None:

@@ -128,7 +128,8 @@ def _say_tracking(result: dict[str, Any], recorded: float, say: Say) -> None:
             after = "" if outage is None else f"{outage['position_rmse_m']:>9.3g} m {outage['in_plane_rmse_m']:>9.3g} m"
             say(
                 f"{name:<24}{own['position_rmse_m']:>8.3g} m{own['position_rmse_sd_m']:>7.2g}"
-                f"{own['velocity_rmse_m_s']:>10.2g} m/s{axes['radial']:>8.2g}{axes['along']:>7.2g}{axes['across']:>8.3g}"
+                f"{own['velocity_rmse_m_s']:>10.2g} m/s"
+                f"{axes['radial']:>8.2g}{axes['along']:>7.2g}{axes['across']:>8.3g}"
                 f"{own['nees']:>6.1f}{ess:>5}{own['ms_per_step']:>7.2f}{after}"
             )
     band = result["gp-ukf"]["nees_band_95"]

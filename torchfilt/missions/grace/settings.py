@@ -23,7 +23,8 @@ class GraceSettings:
         angle_3sigma_deg: of the simulated angles, three standard deviations.
         prior_sd_m, prior_sd_m_s, bias_sd_m: standard deviations of the prior, each axis; priors are off by a draw.
         outage_minutes: length of the gaps without any measurement.
-        outage_starts_h: hours after the start of tracking at which they begin.
+        outage_starts_h: hours after the start of tracking at which they begin; None: a third and three quarters of it,
+            where there is room.
         settle_minutes: first part of the tracking that no error is counted in; a revolution takes 94.
 
     Raises:
@@ -45,7 +46,7 @@ class GraceSettings:
     prior_sd_m_s: float = 0.1
     bias_sd_m: float = 0.1
     outage_minutes: float = 45.0
-    outage_starts_h: tuple[float, ...] = (2.0, 4.5)
+    outage_starts_h: tuple[float, ...] | None = None
     settle_minutes: float = 94.0
 
     def __post_init__(self) -> None:
@@ -68,12 +69,15 @@ class GraceSettings:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not 0 <= self.settle_minutes < 60 * self.tracking_hours:
             raise ValueError(f"settle_minutes must end before the tracking does, got {self.settle_minutes}")
-        for start in self.outage_starts_h:
-            if not 0 <= start <= self.tracking_hours - self.outage_minutes / 60:
+        for start in self.outage_starts_h or ():
+            if not self._has_room(start):
                 raise ValueError(
                     f"outage_starts_h must leave room for {self.outage_minutes} min within {self.tracking_hours} h, "
                     f"got {start}"
                 )
+
+    def _has_room(self, start_h: float) -> bool:
+        return 0 <= start_h <= self.tracking_hours - self.outage_minutes / 60
 
     @property
     def stride(self) -> int:
@@ -99,9 +103,13 @@ class GraceSettings:
     def outage_rows(self) -> list[range]:
         """Measurements that the outages take away."""
         length = round(self.outage_minutes * 60 / self.step_s)
-        starts = [round(hours * 3600 / self.step_s) for hours in self.outage_starts_h]
+        hours = self.outage_starts_h
+        if hours is None:
+            hours = tuple(h for h in (self.tracking_hours / 3, self.tracking_hours * 3 / 4) if self._has_room(h))
+        starts = [round(h * 3600 / self.step_s) for h in hours]
         return [range(start, start + length) for start in starts]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready values."""
-        return asdict(self) | {"outage_starts_h": list(self.outage_starts_h)}
+        starts = self.outage_starts_h
+        return asdict(self) | {"outage_starts_h": None if starts is None else list(starts)}
