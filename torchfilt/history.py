@@ -2,9 +2,11 @@
 
 import io
 import json
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import BadZipFile
 
 import torch
 from torch import Tensor
@@ -127,7 +129,8 @@ class History:
             final = _belief(tensors, "final", head, space)
             recorded = {name for name in tensors if name.startswith("beliefs.")}
             beliefs = _belief(tensors, "beliefs", head, space) if recorded else None
-            info = StepInfo(**{name: tensors.get(f"info.{name}") for name in StepInfo._fields})  # type: ignore[arg-type]
+            optional = {name: tensors.get(f"info.{name}") for name in StepInfo._fields[2:]}
+            info = StepInfo(tensors["info.log_likelihood"], tensors["info.ok"], **optional)
             return cls(
                 tensors["mean"],
                 info,
@@ -137,8 +140,22 @@ class History:
                 beliefs,
                 tensors.get("covariance"),
             )
-        except (KeyError, ValueError, TypeError, OSError) as error:
+        except _NOT_A_HISTORY as error:
             raise IntegrityError(f"{path}: not a history of this version ({error})") from None
+
+
+# What archives, arrays and heads that are not ours make the readers raise.
+_NOT_A_HISTORY = (
+    KeyError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    OSError,
+    EOFError,
+    RuntimeError,
+    BadZipFile,
+    zlib.error,
+)
 
 
 _SPACES = {"Euclidean": Euclidean, "Angle": Angle, "UnitQuaternion": UnitQuaternion}
