@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import _threads  # noqa: F401 - first of all
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 

@@ -13,25 +13,21 @@ filtered mean at every step; rows that do less are marked with *. Outputs are co
 
 import argparse
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import _harness as harness
+import _loops as loops
+import _problems as problems
 import numpy as np
 import torch
+from _harness import Row
 from torch import Tensor
 
+import torchfilt as tf
+
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE))  # so that the shared files are found when a test imports this one
-
-import _harness as harness  # noqa: E402
-import _loops as loops  # noqa: E402
-import _problems as problems  # noqa: E402
-from _harness import Row  # noqa: E402
-
-import torchfilt as tf  # noqa: E402
-
 PEERS = HERE.parent / ".venv-peers" / "bin" / "python"
 SINGLE, DOUBLE = torch.float32, torch.float64
 
@@ -86,16 +82,11 @@ def _asked(answer: dict[str, Any]) -> tuple[float, tuple[float, np.ndarray]]:
     return answer["seconds"], (answer["log_likelihood"], np.array(answer["means"]))
 
 
-BARE_OF = {
-    "f32 torchfilt": "f32 bare torch, in place",
-    "f64 torchfilt, fast normals": "f64 bare torch, in place, f32 normals",
-    "f64 torchfilt": "f64 bare torch, in place",
-}
-
-
 def bare_row(name: str) -> str:
     """The in-place loop that a row is compared with: same precision, same precision of the normals."""
-    return BARE_OF.get(name, "f32 bare torch, in place" if name.startswith("f32") else "f64 bare torch, in place")
+    if name in ("f64 torchfilt, fast normals", "f64 bare torch, in place, f32 normals"):
+        return "f64 bare torch, in place, f32 normals"
+    return f"{name[:3]} bare torch, in place"
 
 
 def check_particles(problem: problems.Linear, n: int, timings: dict[str, harness.Timing]) -> None:
@@ -159,7 +150,7 @@ def run_particles(sizes: list[int], steps: int, rounds: int) -> tuple[str, dict[
     )
     text = (
         f"Bootstrap filter, 6 states, 3 measured, systematic resampling at every step, {steps} steps.\n"
-        "ns a particle and step (ratio to the bare in-place loop of the same precision):\n\n"
+        "ns a particle and step (ratio to the bare in-place loop of the same precision, of the normals too):\n\n"
         + harness.table(["", *(f"n = {n:.0e}".replace("e+0", "e") for n in sizes)], body)
         + f"\n\nATen calls a step: torchfilt {calls:.0f} ({views:.0f} of them views), "
         f"bare in place {bare_calls:.0f} ({bare_views:.0f})."

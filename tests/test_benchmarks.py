@@ -19,10 +19,10 @@ def bench():
     pytest.importorskip("filterpy")
     spec = importlib.util.spec_from_file_location("bench_filters", FOLDER / "bench_filters.py")
     module = importlib.util.module_from_spec(spec)
-    path = list(sys.path)
-    spec.loader.exec_module(module)
-    yield module
-    sys.path[:] = path
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(FOLDER)  # where a script finds the files it shares with others
+        spec.loader.exec_module(module)
+    return module
 
 
 @pytest.mark.slow
