@@ -181,10 +181,10 @@ def _reweight(belief: Particles, proposed: Proposed) -> tuple[Particles, Tensor,
     after = Particles(proposed.x, log_weights - log_likelihood.unsqueeze(-1), proposed.scale_tril, proposed.space)
     if not torch.compiler.is_compiling() and bool(ok.all()):
         return after, log_likelihood, ok
-    return _mend(belief, proposed, log_weights, ok)
+    return _mend(belief, proposed, log_weights)
 
 
-def _mend(belief: Particles, proposed: Proposed, log_weights: Tensor, ok: Tensor) -> tuple[Particles, Tensor, Tensor]:
+def _mend(belief: Particles, proposed: Proposed, log_weights: Tensor) -> tuple[Particles, Tensor, Tensor]:
     """Rows with weights that are not numbers: such particles get weight zero, rows without any keep what they had."""
     sick = torch.isnan(log_weights) | (log_weights == math.inf)
     cleaned = torch.where(sick, -math.inf, log_weights)
@@ -199,7 +199,7 @@ def _mend(belief: Particles, proposed: Proposed, log_weights: Tensor, ok: Tensor
     if factor is not None:
         before = belief.scale_tril if belief.scale_tril is not None else torch.zeros_like(factor)
         factor = torch.where(bad.unsqueeze(-1), before, factor)
-    return Particles(x, kept, factor, proposed.space), log_likelihood, ok & alive
+    return Particles(x, kept, factor, proposed.space), log_likelihood, alive & torch.isfinite(x).all(-1).all(-1)
 
 
 def _draw_initial(initial: Conditional, noise: Tensor, shape: tuple[int, ...], seed: int) -> Tensor:
