@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchfilt.linalg import apply_factor, log_abs_diagonal, triangularize, whiten
-from torchfilt.spaces import EUCLIDEAN, Space
+from torchfilt.spaces import EUCLIDEAN, Euclidean, Space
 
 LOG_2PI = math.log(2 * math.pi)
 
@@ -50,7 +50,11 @@ class Gaussian(NamedTuple):
 
     def sample(self, noise: Tensor) -> Tensor:
         """Draws made from standard normal ``noise`` (..., e); returns (..., d)."""
-        return self.space.retract(self.mean, apply_factor(self.scale_tril, noise, diagonal=self.is_diagonal))
+        mean, factor = self.mean, self.scale_tril
+        flat = mean.dim() == 2 and factor.dim() == 2 and mean.shape == noise.shape and not self.is_diagonal
+        if flat and isinstance(self.space, Euclidean):
+            return torch.addmm(mean.mT, factor, noise.mT).mT  # one pass over the particles
+        return self.space.retract(mean, apply_factor(factor, noise, diagonal=self.is_diagonal))
 
     def log_prob(self, x: Tensor, observed: Tensor | None = None) -> Tensor:
         """Log-density (per unit of tangent volume at the mean) of points x (..., d); returns (...).
@@ -62,7 +66,7 @@ class Gaussian(NamedTuple):
             return self._marginal_log_prob(x, observed)
         z = whiten(self.scale_tril, self.space.local(self.mean, x), diagonal=self.is_diagonal)
         log_volume = log_abs_diagonal(self.scale_tril, diagonal=self.is_diagonal)
-        return -0.5 * z.square().sum(-1) - (log_volume + 0.5 * self.tangent_size * LOG_2PI)
+        return torch.sub(-0.5 * LOG_2PI * self.tangent_size - log_volume, z.square().sum(-1), alpha=0.5)
 
     def _marginal_log_prob(self, x: Tensor, observed: Tensor) -> Tensor:
         present = observed.to(self.mean.dtype)

@@ -135,7 +135,8 @@ def whiten(factor: Tensor, residual: Tensor, *, diagonal: bool = False) -> Tenso
         return torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
     if factor.dim() == 2:
         if residual.dim() == 2:
-            return torch.linalg.solve_triangular(factor, residual.mT, upper=False).mT
+            # From the right: the solver takes a particle-last layout as it lies, without a copy.
+            return torch.linalg.solve_triangular(factor.mT, residual, upper=True, left=False)
         # Broadcasting a shared factor would copy it for each row; inverting the small triangle once is cheaper.
         identity = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
         return (torch.linalg.solve_triangular(factor, identity, upper=False) @ residual.mT).mT

@@ -1,5 +1,6 @@
 """Random numbers as tensors, a pure function of (seed, step, purpose)."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -33,6 +34,12 @@ def _permute(word: int, key: int) -> int:
     return word
 
 
+@lru_cache(maxsize=64)
+def _keys(seed: int) -> tuple[int, int]:
+    key = _mix(seed & _MASK)
+    return key, _mix(key)
+
+
 class NoiseSource(NamedTuple):
     """Stateless source: the same (seed, step, stream) gives the same numbers, in any order, whatever the thread count.
 
@@ -57,16 +64,19 @@ class NoiseSource(NamedTuple):
         """
         if not 0 <= stream < STREAMS:
             raise ValueError(f"stream must be in [0, {STREAMS}), got {stream}")
-        key = _mix(self.seed & _MASK)
-        low = _permute((step * STREAMS + stream) & _WORD, _mix(key))
+        key, shuffle = _keys(self.seed)
+        low = _permute((step * STREAMS + stream) & _WORD, shuffle)
         return (_mix(_mix(key ^ (step & _MASK)) ^ stream) >> 33) << 32 | low
 
     def normal(self, shape: tuple[int, ...], step: int, stream: int, like: Tensor) -> Tensor:
         """Standard normals of ``shape`` (*batch, n, d), laid out component by component in memory."""
+        return self.next_normal(shape, self.generator(step, stream, like.device), like)
+
+    def next_normal(self, shape: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
+        """The same from a generator of this source that other draws may have used before."""
         draw_dtype = torch.float32 if self.fast_normals else like.dtype
-        generator = self.generator(step, stream, like.device)
         draws = torch.randn((shape[-1], *shape[:-1]), generator=generator, dtype=draw_dtype, device=like.device)
-        return draws.to(like.dtype).movedim(0, -1)
+        return draws.to(like.dtype).movedim(0, -1) if draws.dim() != 2 else draws.to(like.dtype).mT
 
     def uniform(self, shape: tuple[int, ...], step: int, stream: int, like: Tensor) -> Tensor:
         """Uniforms in [0, 1) of ``shape``, float64: resampling positions need the resolution."""

@@ -13,18 +13,22 @@ class Particles(NamedTuple):
     """Particles x (*batch, n, d) with normalised log-weights (*batch, n).
 
     scale_tril (*batch, n, e, e), or (*batch, 1, e, e) when all particles share it, makes each particle a Gaussian;
-    None means points.
+    None means points. ``held`` keeps (log_weights, weights) where the weights were already made; it counts only for the
+    very log_weights it names, so replacing these is safe.
     """
 
     x: Tensor
     log_weights: Tensor
     scale_tril: Tensor | None = None
     space: Space = EUCLIDEAN
+    held: tuple[Tensor, Tensor] | None = None
 
     @property
     def weights(self) -> Tensor:
         """Normalised weights (*batch, n)."""
-        return self.log_weights.exp()
+        if self.held is not None and self.held[0] is self.log_weights:
+            return self.held[1]
+        return torch.softmax(self.log_weights, -1)
 
     @property
     def mean(self) -> Tensor:
@@ -39,7 +43,7 @@ class Particles(NamedTuple):
     @property
     def ess(self) -> Tensor:
         """Effective sample size, 1 / sum of squared weights, (*batch)."""
-        return torch.exp(-torch.logsumexp(2 * self.log_weights, -1))
+        return steady_sum(self.weights.square(), -1).reciprocal()
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Mean (*batch, d) and covariance (*batch, e, e) of the mixture."""

@@ -42,6 +42,8 @@ def _counts_to_ancestors(ends: Tensor) -> Tensor:
     ancestor(i) = number of particles j < n - 1 with ends(j) <= i, a running sum of a histogram: O(n), no search.
     """
     n = ends.shape[-1]
+    if ends.dim() == 1 and not torch.compiler.is_compiling():
+        return torch.bincount(ends[:-1], minlength=n + 1)[:n].cumsum(0)
     rows = ends.numel() // n
     flat = ends[..., :-1].reshape(rows, n - 1)
     if torch.compiler.is_compiling():  # bincount has no static shape
@@ -56,14 +58,19 @@ def _counts_to_ancestors(ends: Tensor) -> Tensor:
 
 def _ordered(weights: Tensor, positions_below: Callable[[Tensor, int], Tensor]) -> Tensor:
     n = weights.shape[-1]
-    cumulative = weights.to(torch.float64).cumsum(-1)
-    cumulative = cumulative * (n / cumulative[..., -1:])
+    cumulative = weights.cumsum(-1, dtype=torch.float64)
+    cumulative *= n / cumulative[..., -1:]
     return _counts_to_ancestors(positions_below(cumulative, n).clamp_(0, n))
 
 
 def _systematic(weights: Tensor, u: Tensor) -> Tensor:
     # Positions (i + u) below c: i < c - u.
-    return _ordered(weights, lambda c, n: c.sub(u).ceil_().long())
+    if weights.dim() == 1 and not torch.compiler.is_compiling():  # one row: the same numbers with fewer calls
+        n = len(weights)
+        ends = weights.cumsum(0, dtype=torch.float64)
+        ends = ends.mul_(n / ends[-1]).sub_(u).ceil_().clamp_(0, n)
+        return torch.bincount(ends[:-1].long(), minlength=n + 1)[:n].cumsum(0)
+    return _ordered(weights, lambda c, n: c.sub_(u).ceil_().long())
 
 
 def _stratified(weights: Tensor, u: Tensor) -> Tensor:
@@ -130,6 +137,8 @@ def gather_particles(values: Tensor, ancestors: Tensor) -> Tensor:
 
     The copy is made component by component in flat memory: 2 to 9 times faster than a general gather.
     """
+    if ancestors.dim() == 1 and values.dim() == 2:
+        return values.mT.index_select(-1, ancestors).mT
     batch_dims = ancestors.dim()
     n = ancestors.shape[-1]
     rest = values.shape[batch_dims:]

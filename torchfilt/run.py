@@ -164,6 +164,7 @@ class Filter(nn.Module, Generic[B]):
         missing = _missing_by_step(measurements)
         recorder = Recorder(record, self.evidence)
         belief, start = state.belief, state.step
+        _keep_memory(belief)
         for k in _counted(len(measurements), progress):
             noise = self.draw(belief, start + k, state.seed)
             u = None if controls is None else controls[k]
@@ -181,6 +182,20 @@ class Filter(nn.Module, Generic[B]):
 
 def _batch_of(belief: Gaussian | Particles) -> torch.Size:
     return belief.mean.shape[:-1] if isinstance(belief, Gaussian) else belief.x.shape[:-2]
+
+
+# The largest block whose release still raises glibc's thresholds.
+_LARGEST_BLOCK = 32 * 2**20 - 2**16
+
+
+def _keep_memory(belief: Gaussian | Particles) -> None:
+    """Teach the C allocator to keep blocks of a cloud's size: it returns them to the system at each step otherwise.
+
+    glibc raises its thresholds when a large block is released; an empty block that is never touched costs nothing.
+    """
+    if isinstance(belief, Particles) and belief.x.device.type == "cpu":
+        wanted = 16 * belief.x.numel() * belief.x.element_size()
+        torch.empty(min(wanted, _LARGEST_BLOCK), dtype=torch.uint8)
 
 
 def _check_measurements(y: Tensor, belief: Gaussian | Particles, name: str, batch: torch.Size) -> None:

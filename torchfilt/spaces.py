@@ -50,13 +50,17 @@ class Space(Protocol):
         ...
 
 
+# Shorter sums torch never shares between threads (its grain size).
+_SHARED_SUM = 32768
+
+
 def steady_sum(values: Tensor, dim: int) -> Tensor:
     """Sum over a dim, counted from the end: the same bits for any thread count.
 
-    torch shares one sum between threads only when there is nothing else to share; beside a copy of itself, which takes
-    no memory, it stays whole.
+    torch shares one long sum between threads only when there is nothing else to share; beside a copy of itself, which
+    takes no memory, it stays whole.
     """
-    if values.numel() == values.shape[dim]:
+    if values.numel() == values.shape[dim] and values.numel() >= _SHARED_SUM:
         return values.expand(2, *values.shape).sum(dim)[0]
     return values.sum(dim)
 

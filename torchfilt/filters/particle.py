@@ -19,7 +19,7 @@ from torchfilt.run import Filter, Step
 from torchfilt.types import FilterState, StepInfo, StepNoise
 
 # Purposes of random numbers: each has a sequence of its own.
-_INITIAL, _INITIAL_SPLIT, _PROPOSAL, _RESAMPLING, _REDRAW, _MOVE, _ACCEPT, _OWN = range(8)
+_INITIAL, _INITIAL_SPLIT, _STEP, _MOVE, _ACCEPT, _OWN = range(6)
 
 
 class ParticleFilter(Filter[Particles]):
@@ -59,7 +59,7 @@ class ParticleFilter(Filter[Particles]):
         super().__init__(model)
         if particles < 2:
             raise ValueError(f"particles must be at least 2, got {particles}")
-        size = self._tangent_size()
+        size = self.tangent_size = _tangent_size(model.initial())
         if getattr(proposal, "pooled", False) and particles < size + 2:
             raise ValueError(
                 f"a pooled redraw in {size} dimensions needs at least {size + 2} particles, got {particles}"
@@ -73,21 +73,15 @@ class ParticleFilter(Filter[Particles]):
         self.fast_normals = fast_normals
         self.evidence = proposal.evidence
 
-    def _tangent_size(self) -> int:
-        initial = self.model.initial()
-        if isinstance(initial, Gaussian):
-            return initial.tangent_size
-        return (*initial.batch_shape, *initial.event_shape)[-1] if initial.batch_shape or initial.event_shape else 1
-
     def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[Particles]:
         """Particles of the initial law for ``batch_shape`` independent runs, x (*batch, n, d)."""
         initial = self.model.initial()
         shape = (*batch_shape, self.particles)
         source = NoiseSource(seed, self.fast_normals)
         like = initial.mean
-        noise = source.normal((*shape, self._tangent_size()), 0, _INITIAL, like)
+        noise = source.normal((*shape, self.tangent_size), 0, _INITIAL, like)
         draws = _draw_initial(initial, noise, shape, source.seed_of(0, _OWN))
-        split = source.normal((*shape, self._tangent_size()), 0, _INITIAL_SPLIT, like)
+        split = source.normal((*shape, self.tangent_size), 0, _INITIAL_SPLIT, like)
         return FilterState(self.proposal.start(initial, draws, split), 0, seed)
 
     def draw(self, belief: Particles, step: int, seed: int) -> StepNoise:
@@ -95,16 +89,18 @@ class ParticleFilter(Filter[Particles]):
         source = NoiseSource(seed, self.fast_normals)
         like, shape = belief.x, belief.x.shape[:-1]
         step = step + 1  # zero is the initial draw
-        full = (*shape, self._tangent_size())
-        uniforms = self.resampler.uniforms(shape[-1]) if self.resampler.threshold > 0 else 0
-        redraw = source.normal(full, step, _REDRAW, like) if self.proposal.needs_redraw_noise else None
+        full = (*shape, self.tangent_size)
+        generator = source.generator(step, _STEP, like.device)
+        count = self.resampler.uniforms(shape[-1]) if self.resampler.threshold > 0 else 0
+        uniforms = torch.rand((*shape[:-1], count), generator=generator, dtype=torch.float64, device=like.device)
+        redraw = source.next_normal(full, generator, like) if self.proposal.needs_redraw_noise else None
         normal = uniform = None
         if self.move is not None:
             normal = source.normal((self.move.steps, *full), step, _MOVE, like)
             uniform = source.uniform((self.move.steps, *shape), step, _ACCEPT, like)
         return StepNoise(
-            source.normal(full, step, _PROPOSAL, like) if self.proposal.draws_at_once else None,
-            source.uniform((*shape[:-1], uniforms), step, _RESAMPLING, like),
+            source.next_normal(full, generator, like) if self.proposal.draws_at_once else None,
+            uniforms,
             redraw,
             normal,
             uniform,
@@ -147,7 +143,8 @@ class ParticleFilter(Filter[Particles]):
     def _resample(self, belief: Particles, uniforms: Tensor) -> tuple[Particles, Tensor, Tensor | None]:
         """Particles with new weights, their ancestors (*batch, n) and the rows that were resampled (None: all)."""
         n = belief.log_weights.shape[-1]
-        weights = belief.log_weights.detach().exp()
+        weights = belief.weights
+        weights = weights.detach() if weights.requires_grad else weights
         if self.resampler.threshold == math.inf:
             ancestors = self.resampler(weights, uniforms)
             return self._select(belief, ancestors, None), ancestors, None
@@ -163,23 +160,26 @@ class ParticleFilter(Filter[Particles]):
         factor = belief.scale_tril
         if factor is not None and factor.shape[-3] > 1:
             factor = gather_particles(factor, ancestors)
-        log_weights = uniform_log_weights(ancestors.shape, belief.log_weights)
+        log_weights = belief.log_weights.new_full((), -math.log(ancestors.shape[-1])).expand(ancestors.shape)
         if belief.log_weights.requires_grad and torch.is_grad_enabled():
             score = belief.log_weights.gather(-1, ancestors)
             # A particle of weight zero has no ancestor but may stand in the unchosen rows.
             log_weights = log_weights + torch.where(torch.isfinite(score), score - score.detach(), 0)
         if chosen is not None:
             log_weights = torch.where(chosen.unsqueeze(-1), log_weights, belief.log_weights)
-        return belief._replace(x=x, log_weights=log_weights, scale_tril=factor)
+        return Particles(x, log_weights, factor, belief.space)
 
 
 def _reweight(belief: Particles, proposed: Proposed) -> tuple[Particles, Tensor, Tensor]:
     """Normalised posterior, log-likelihood (*batch) and status (*batch)."""
     log_weights = belief.log_weights + proposed.log_weight
-    log_likelihood = torch.logsumexp(log_weights, -1)
-    ok = torch.isfinite(log_likelihood)
-    after = Particles(proposed.x, log_weights - log_likelihood.unsqueeze(-1), proposed.scale_tril, proposed.space)
-    if not torch.compiler.is_compiling() and bool(ok.all()):
+    normalised = torch.log_softmax(log_weights, -1)
+    # Both largest entries belong to the same particle; one pass less over the particles than logsumexp takes.
+    log_likelihood = log_weights.amax(-1) - normalised.amax(-1)
+    ok = log_likelihood - log_likelihood == 0  # neither NaN nor infinite
+    held = (normalised, torch.softmax(log_weights, -1))
+    after = Particles(proposed.x, normalised, proposed.scale_tril, proposed.space, held)
+    if not torch.compiler.is_compiling() and bool(ok if ok.dim() == 0 else ok.all()):
         return after, log_likelihood, ok
     return _mend(belief, proposed, log_weights)
 
@@ -200,6 +200,12 @@ def _mend(belief: Particles, proposed: Proposed, log_weights: Tensor) -> tuple[P
         before = belief.scale_tril if belief.scale_tril is not None else torch.zeros_like(factor)
         factor = torch.where(bad.unsqueeze(-1), before, factor)
     return Particles(x, kept, factor, proposed.space), log_likelihood, alive & torch.isfinite(x).all(-1).all(-1)
+
+
+def _tangent_size(initial: Conditional) -> int:
+    if isinstance(initial, Gaussian):
+        return initial.tangent_size
+    return (*initial.batch_shape, *initial.event_shape)[-1] if initial.batch_shape or initial.event_shape else 1
 
 
 def _draw_initial(initial: Conditional, noise: Tensor, shape: tuple[int, ...], seed: int) -> Tensor:
