@@ -184,7 +184,7 @@ def train_gp(
 ) -> tuple[FrozenGP, dict[str, Any]]:
     """Learn the one-step map.
 
-    The pairs come from the study's own formation whatever the case, so that the GP was not trained at the start "moved".
+    The pairs come from the study's own formation whatever the case: the GP was not trained at the start of "moved".
     The case "leak" takes the study's form: samples of the trajectory itself, no nominal dynamics, no phase. Such a GP
     turns every state back to the curve it remembers.
 
