@@ -211,6 +211,21 @@ def test_draws_have_the_moments_of_the_law(diagonal, lead):
     assert ((sample - covariance) / spread).abs().max() < 5.5
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("space", [Euclidean(3), Angle(3)])
+@pytest.mark.parametrize(
+    ("mean_lead", "noise_lead"), [((), (7,)), ((7,), (7,)), ((1,), (7,)), ((4, 7), (4, 7)), ((7,), (4, 7))]
+)
+def test_a_draw_is_the_mean_moved_by_the_factor(dtype, space, mean_lead, noise_lead):
+    """Each shape may take a way of its own to the same numbers."""
+    mean, noise = 0.3 * normals(*mean_lead, 3, seed=0, dtype=dtype), 0.3 * normals(*noise_lead, 3, seed=1, dtype=dtype)
+    factor = factors(3, seed=2, dtype=dtype)
+    draw = Gaussian(mean, factor, space).sample(noise)
+    expected = mean.double().numpy() + np.einsum("ij,...j->...i", factor.double().numpy(), noise.double().numpy())
+    assert draw.dtype == dtype
+    np.testing.assert_allclose(draw, expected, rtol=0, atol=16 * torch.finfo(dtype).eps)
+
+
 def test_draws_without_spread_are_the_mean():
     law = Gaussian(normals(4, 3, seed=0), torch.zeros(3, dtype=torch.float64), is_diagonal=True)
     assert torch.equal(law.sample(normals(4, 3, seed=1)), law.mean)
