@@ -198,3 +198,13 @@ def test_moments_under_vmap_and_compile(space):
     for function in (torch.vmap(value), compiled):
         for ours, eager in zip(function(*arguments), expected, strict=True):
             torch.testing.assert_close(ours, eager, rtol=1e-13, atol=1e-14)
+
+
+def test_weights_held_beside_log_weights_count_for_these_alone() -> None:
+    log_weights = torch.log(torch.tensor([0.2, 0.3, 0.5], dtype=torch.float64))
+    held = (log_weights, log_weights.exp())
+    cloud = Particles(torch.eye(3, dtype=torch.float64), log_weights, held=held)
+    assert cloud.weights is held[1]
+    other = torch.log(torch.tensor([0.7, 0.2, 0.1], dtype=torch.float64))
+    torch.testing.assert_close(cloud._replace(log_weights=other).weights, other.exp(), rtol=1e-15, atol=0)
+    torch.testing.assert_close(cloud._replace(log_weights=other).mean, other.exp(), rtol=1e-15, atol=0)
