@@ -57,6 +57,7 @@ class _Factor(nn.Module):
             return
         factor = psd_factor(covariance) if covariance is not None else scale_tril
         assert factor is not None
+        check_factor(factor, "scale_tril")
         hold(self, "scale_tril", factor, trainable)
 
     def forward(self) -> Tensor:
@@ -119,6 +120,9 @@ class LinearGaussian(nn.Module):
             raise ValueError(f"offset must end in {m} to fit matrix {tuple(matrix.shape)}, got {tuple(offset.shape)}")
         if control_matrix is not None and control_matrix.shape[-2] != m:
             raise ValueError(f"control_matrix must have {m} rows, got shape {tuple(control_matrix.shape)}")
+        for name, tensor in (("offset", offset), ("control_matrix", control_matrix)):
+            if tensor is not None:
+                check_finite(tensor, name)
         hold(self, "matrix", matrix, trainable)
         for name, tensor in (("offset", offset), ("control_matrix", control_matrix)):
             if tensor is None:
@@ -139,6 +143,8 @@ class LinearGaussian(nn.Module):
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None) -> Gaussian:
         """Law of y given x (..., d)."""
         matrix, offset, scale_tril = self.linear_form(u, dt)
+        if matrix.dim() > 2:  # a matrix a row of the batch serves all points of the row
+            matrix = matrix.unflatten(-3, (-1, *[1] * max(x.dim() + 1 - matrix.dim(), 0)))
         mean = (matrix @ x.mT).mT if x.dim() > 1 and matrix.dim() == 2 else (matrix @ x.unsqueeze(-1)).squeeze(-1)
         return Gaussian(mean if offset is None else mean + offset, scale_tril)
 
@@ -210,6 +216,23 @@ def call_style(function: Callable[..., Any]) -> CallStyle:
         return CallStyle("u" in named, "dt" in named, True)
     required = [p for p in parameters[1:] if p.default is p.empty and p.kind is not p.KEYWORD_ONLY]
     return CallStyle(len(required) > 0, len(required) > 1, False)
+
+
+def takes_in_order(law: Callable[..., Any]) -> bool:
+    """Whether a law can be called as ``law(x, u, dt)``."""
+    target = law.forward if isinstance(law, nn.Module) else law
+    return list(inspect.signature(target).parameters)[1:] == ["u", "dt"]
+
+
+def check_factor(factor: Tensor, name: str) -> None:
+    """Raise a ValueError unless this is a finite lower-triangular matrix (*batch, e, e)."""
+    if factor.dim() < 2 or factor.shape[-1] != factor.shape[-2]:
+        raise ValueError(f"{name} must be a square matrix (*batch, e, e), got shape {tuple(factor.shape)}")
+    check_finite(factor, name)
+    upper = factor.detach().triu(1)
+    if upper.any():
+        where = tuple(upper.nonzero()[0].tolist())
+        raise ValueError(f"{name} must be lower triangular, entry {where} is {upper[where].item()}")
 
 
 def check_finite(tensor: Tensor, name: str) -> None:

@@ -7,11 +7,20 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import call_style, check_finite
+from torchfilt.laws import call_style, check_factor, check_finite, takes_in_order
 from torchfilt.linalg import psd_factor
 from torchfilt.moments import Missing
 
 Conditional = Gaussian | Distribution
+
+# What a law may offer beside the call; `torchfilt.moments` uses it.
+_SHORT_CUTS = ("linear_form", "pooled")
+
+
+def _short_cuts(law: Callable[..., Conditional]) -> list[str]:
+    """What the law offers, with the space that belongs to a linear form."""
+    found = [name for name in _SHORT_CUTS if hasattr(law, name)]
+    return [*found, "space"] if found and hasattr(law, "space") else found
 
 
 class StateSpaceModel(nn.Module):
@@ -39,7 +48,10 @@ class StateSpaceModel(nn.Module):
         self.initial = initial if isinstance(initial, nn.Module) else InitialLaw(initial)
         self.transition = transition
         self.observation = observation
-        self._styles = {"transition": call_style(transition), "observation": call_style(observation)}
+        laws = {"transition": transition, "observation": observation}
+        self._styles = {name: call_style(law) for name, law in laws.items()}
+        self._short_cuts = {name: _short_cuts(law) for name, law in laws.items()}
+        self._direct = {name: bool(self._short_cuts[name]) and takes_in_order(law) for name, law in laws.items()}
 
     def conditional(
         self, name: str, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None
@@ -51,9 +63,15 @@ class StateSpaceModel(nn.Module):
     def moments(self, name: str) -> Callable[..., Gaussian]:
         """The law called ``name`` as (x, u, dt) -> Gaussian; short cuts that it offers stay visible."""
         law = getattr(self, name)
-        if hasattr(law, "linear_form") or hasattr(law, "pooled"):
+        if self._direct[name]:
             return law
-        return lambda x, u=None, dt=None: as_gaussian(self.conditional(name, x, u, dt))
+
+        def called(x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None) -> Gaussian:
+            return as_gaussian(self.conditional(name, x, u, dt))
+
+        for key in self._short_cuts[name]:
+            setattr(called, key, getattr(law, key))
+        return called
 
     def is_linear(self) -> bool:
         """Whether transition and observation are linear in the state with Gaussian noise and say so."""
@@ -83,6 +101,8 @@ class InitialLaw(nn.Module):
         expected = law.space.tangent_size if law.space.tangent_size is not None else law.mean.shape[-1]
         if law.scale_tril.shape[-1] != expected:
             raise ValueError(f"initial scale_tril must end in {expected}, got {tuple(law.scale_tril.shape)}")
+        if not law.is_diagonal:
+            check_factor(law.scale_tril, "initial scale_tril")
         for name, tensor in (("mean", law.mean), ("scale_tril", law.scale_tril)):
             if isinstance(tensor, nn.Parameter):
                 self.register_parameter(name, tensor)

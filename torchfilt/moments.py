@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
 from torchfilt.linalg import apply_factor, cholesky_downdate, log_abs_diagonal, triangularize, whiten
-from torchfilt.spaces import EUCLIDEAN, Space
+from torchfilt.spaces import EUCLIDEAN, Euclidean, Space
 
 Law = Callable[..., Gaussian]
 
@@ -262,6 +262,8 @@ def law_space(law: object) -> Space:
 def predict(law: Law, belief: Gaussian, rule: Rule, u: Tensor | None, dt: Tensor | float | None) -> Gaussian:
     """Belief pushed through a transition law."""
     line = rule.linearize(law, belief, u, dt)
+    if line.space != belief.space and not type(line.space) is type(belief.space) is Euclidean:
+        raise ValueError(f"the transition law gives a state on {line.space!r}, the belief lives on {belief.space!r}")
     if line.mean.shape[-1] != belief.mean.shape[-1]:
         raise ValueError(f"the transition law turns {belief.mean.shape[-1]} state numbers into {line.mean.shape[-1]}")
     factor = triangularize(cat_columns(line.slope, line.spread()))
