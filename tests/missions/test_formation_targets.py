@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from torchfilt.learning import one_step_error, roll_out_error, train_transition
 from torchfilt.missions.formation import (
     StudySettings,
     leakage,
@@ -20,6 +22,14 @@ from torchfilt.missions.formation import (
     run_rmse,
     scene_bound,
     train_gp,
+)
+from torchfilt.models.relative_motion import (
+    ClohessyWiltshire,
+    FormationSettings,
+    chief_controls,
+    phase,
+    simulate_formation,
+    training_pairs,
 )
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -108,12 +118,33 @@ def test_baselines_stay_behind(nominal):
     assert nominal.ratio("cw-ukf", "mf-upf", VELOCITY, "orbit1") >= 15
 
 
-def test_learned_map_is_accurate_and_honest_and_cheap(nominal):
+def test_learned_map_is_accurate_and_cheap(nominal):
     step = nominal.report["one_step"]
-    assert step["position_m"]["rms"] <= 2e-7 and step["velocity_m_s"]["rms"] <= 4e-8
-    assert 0.7 <= step["position_m"]["z_model"] <= 1.3 and 0.7 <= step["velocity_m_s"]["z_model"] <= 1.3
+    assert step["position_m"]["rms"] <= 1e-8 and step["velocity_m_s"]["rms"] <= 2e-9
+    # What is left of the two-body residual is below the noise floor of the regression, so its claims are cautious.
+    assert step["position_m"]["z_model"] <= 1.3 and step["velocity_m_s"]["z_model"] <= 1.3
     assert nominal.report["roll_out_one_revolution_m"] <= 1e-3
     assert nominal.cpu_ms["mf-upf"] <= 5
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_residual_to_linear_motion_is_learned_and_honest(seed):
+    formation = FormationSettings()
+    law, report = train_transition(
+        *training_pairs(formation, "cloud", 500, seed=seed),
+        ClohessyWiltshire(formation.mean_motion_rad_s, 1e-13, 10.0),
+        dt=10.0,
+        context=phase,
+        seed=seed,
+    )
+    test = training_pairs(formation, "cloud", 300, seed=seed + 1_000_003)
+    step = one_step_error(law, *test, 10.0).summary({"position_m": POSITION, "velocity_m_s": VELOCITY})
+    assert step["position_m"]["rms"] <= 2e-7 and step["velocity_m_s"]["rms"] <= 4e-8
+    assert 0.7 <= step["position_m"]["z_model"] <= 1.3 and 0.7 <= step["velocity_m_s"]["z_model"] <= 1.3
+    time = torch.arange(0.0, formation.period_s, 10.0, dtype=torch.float64)
+    truth = simulate_formation(formation, time)
+    assert roll_out_error(law, truth.relative_m_m_s, chief_controls(truth.chief), 10.0) <= 0.02
+    assert report.seconds <= 30 and report.samples == 500
 
 
 def test_start_that_was_not_learned():
