@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.linalg import apply_factor, triangularize
+from torchfilt.linalg import apply_factor
 from torchfilt.model import StateSpaceModel, as_gaussian, log_prob
 from torchfilt.moments import Missing
 from torchfilt.particles import Particles
+from torchfilt.proposals import steady_triangularize
 from torchfilt.types import StepNoise
 
 Step = Tensor | float | None
@@ -105,7 +106,7 @@ def _cloud_factor(particles: Particles) -> Tensor:
     weights = particles.weights
     mean = particles.space.mean(particles.x, weights)
     apart = particles.space.local(mean.unsqueeze(-2), particles.x)
-    return triangularize((apart * weights.sqrt().unsqueeze(-1)).mT).unsqueeze(-3)
+    return steady_triangularize((apart * weights.sqrt().unsqueeze(-1)).mT).unsqueeze(-3)
 
 
 def _predictive(law: Gaussian, weights: Tensor) -> Gaussian:
@@ -119,4 +120,4 @@ def _predictive(law: Gaussian, weights: Tensor) -> Gaussian:
     else:
         own = factor if factor.dim() == 2 else factor.squeeze(-3)
         own = own.expand(*apart.shape[:-2], -1, -1)
-    return Gaussian(mean.unsqueeze(-2), triangularize(torch.cat([apart.mT, own], -1)).unsqueeze(-3), law.space)
+    return Gaussian(mean.unsqueeze(-2), steady_triangularize(torch.cat([apart.mT, own], -1)).unsqueeze(-3), law.space)

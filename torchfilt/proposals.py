@@ -194,10 +194,10 @@ class Local:
         own = particles.scale_tril
         own = own if own.shape[-3] == 1 else own * root.unsqueeze(-1)
         columns = torch.cat([(apart * root).mT, own.movedim(-3, -2).flatten(-2)], -1)
-        whole = triangularize(columns)
+        whole = steady_triangularize(columns)
         drawn = apart + apply_factor(particles.scale_tril, noise)
         drawn = drawn - weighted_sum(drawn, weights).unsqueeze(-2)
-        found = triangularize((drawn * root).mT)
+        found = steady_triangularize((drawn * root).mT)
         # whole found^-1 takes the draws' covariance to the cloud's.
         matched = whole @ torch.linalg.solve_triangular(found, drawn.mT, upper=False)
         x = space.retract(mean.unsqueeze(-2), ((1 - self.split) ** 0.5 * matched).mT)
@@ -253,6 +253,22 @@ class Local:
         if factor.dim() == 2:  # shared by everyone: what particles carry has a row and a particle axis
             factor = factor.expand(*particles.x.shape[:-2], 1, -1, -1)
         return step._replace(scale_tril=factor, is_diagonal=False), law
+
+
+_BLOCK = 1024
+
+
+def steady_triangularize(columns: Tensor) -> Tensor:
+    """`torchfilt.linalg.triangularize` of many columns (*batch, e, k) in blocks: the same bits for any thread count.
+
+    LAPACK shares one long factorisation between threads, which then round differently; blocks are too short for that.
+    """
+    while columns.shape[-1] >= 2 * _BLOCK:
+        count = columns.shape[-1] // _BLOCK - 1  # the last block takes the rest, so that none is short
+        head, rest = columns[..., : count * _BLOCK], columns[..., count * _BLOCK :]
+        factors = triangularize(head.unflatten(-1, (count, _BLOCK)).movedim(-2, -3))
+        columns = torch.cat([factors.movedim(-3, -2).flatten(-2), triangularize(rest)], -1)
+    return triangularize(columns)
 
 
 def _equal_weights(x: Tensor, factor: Tensor | None, space: Space) -> Particles:
