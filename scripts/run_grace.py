@@ -5,19 +5,19 @@ track them through the hours that follow.
 GRACE A and B on 27 July 2010. Gaussian processes learn what a nominal law of
 motion misses; predictions without measurements and three filters are compared
 with the precise orbits of hours that were not learned from. The run folder
-receives settings, metrics, figures and the checkpoints of the training.
+receives settings, metrics, a table, figures and the finished parts.
 """
 
-import json
+import signal
 import sys
 from argparse import RawDescriptionHelpFormatter
 from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Any
 
 from jsonargparse import ArgumentParser, DefaultHelpFormatter
 
-EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_STOPPED = 0, 1, 2, 130
-SETTINGS, METRICS = "settings.json", "metrics.json"
+EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 
 EXAMPLES = """\
 examples:
@@ -30,7 +30,8 @@ examples:
   the same run with another seed
     run_grace.py --config runs/grace/settings.json --seed 1 --out runs/grace-1
 
-exit codes: 0 done, 1 failed, 2 wrong use, 130 stopped by SIGINT.
+exit codes: 0 done, 1 failed, 2 wrong use, 130 or 143 stopped by SIGINT or
+SIGTERM, finished parts kept.
 """
 
 
@@ -95,6 +96,7 @@ def build_parser() -> ArgumentParser:
 
     group = parser.add_argument_group("Output")
     group.add_argument("--out", default="runs/grace", type=str, metavar="DIR", help="run folder")
+    group.add_argument("--resume", action="store_true", help="keep the finished parts that the run folder holds")
     group.add_argument("--force", action="store_true", help="overwrite the run in the run folder")
     group.add_argument("--figures", default=True, type=bool, metavar="BOOL", help="draw figures")
     group.add_argument("--threads", type=int | None, metavar="N", help="CPU threads; as many as torch likes")
@@ -103,49 +105,85 @@ def build_parser() -> ArgumentParser:
     return parser
 
 
+class UsageError(Exception):
+    """Options that make no sense, or would destroy something."""
+
+
+class Stop:
+    """SIGINT and SIGTERM end the run at once; finished parts are kept."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> "Stop":
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self.received = number
+        raise KeyboardInterrupt
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run and return the exit code."""
     options = build_parser().parse_args(sys.argv[1:] if arguments is None else arguments).as_dict()
-    options.pop("config", None)
-    out, force, figures, threads, quiet, debug = (
-        options.pop(name) for name in ("out", "force", "figures", "threads", "quiet", "debug")
-    )
-    folder = Path(out)
-    if folder.exists() and not folder.is_dir():
-        return _fail(ValueError(f"--out {out}: not a folder"), debug, EXIT_USAGE)
-    if (folder / METRICS).exists() and not force:
-        return _fail(ValueError(f"{out} holds a run already: give --force or another --out"), debug, EXIT_USAGE)
-
-    import torch
-
-    from torchfilt.missions.grace.campaign import run
-    from torchfilt.missions.grace.settings import GraceSettings
-    from torchfilt.storage import atomic_write
-
+    out, debug = options["out"], options["debug"]
+    stop = Stop()
     try:
-        starts = options.pop("outage_starts_h")
-        settings = GraceSettings(**options, outage_starts_h=None if starts is None else tuple(starts))
-    except ValueError as error:
+        with stop:
+            _run(options)
+    except (KeyboardInterrupt, SystemExit):  # a training turns the first into the second
+        if not stop.received:
+            raise
+        print(f"run_grace.py: stopped; go on with --resume --out {out}", file=sys.stderr)
+        return 128 + stop.received
+    except UsageError as error:
         return _fail(error, debug, EXIT_USAGE)
-    if threads is not None:
-        torch.set_num_threads(threads)
-    try:
-        (folder / METRICS).unlink(missing_ok=True)
-        atomic_write(folder / SETTINGS, _json(settings.to_dict()))
-        say = (lambda line: None) if quiet else print
-        result = run(settings, out=folder, figures=figures, say=say, progress=not quiet)
-        # Written last: a folder with metrics is a finished run.
-        atomic_write(folder / METRICS, _json({"grace": result}))
-    except KeyboardInterrupt:
-        print("run_grace.py: stopped", file=sys.stderr)
-        return EXIT_STOPPED
     except Exception as error:
         return _fail(error, debug, EXIT_FAILED)
     return EXIT_OK
 
 
-def _json(value: Any) -> bytes:
-    return (json.dumps(value, indent=1) + "\n").encode()
+def _run(options: dict[str, Any]) -> None:
+    options.pop("config", None)
+    out, force, resume, figures, threads, quiet, _ = (
+        options.pop(name) for name in ("out", "force", "resume", "figures", "threads", "quiet", "debug")
+    )
+    folder = Path(out)
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"--out {out}: not a folder")
+    if resume and force:
+        raise UsageError("--resume goes on with a run and --force overwrites it: give one of them")
+    if (folder / "settings.json").exists() and not (resume or force):
+        raise UsageError(f"--out {out} holds a run already: --resume goes on with it, --force overwrites it")
+
+    import torch
+
+    from torchfilt.missions.grace.campaign import run
+    from torchfilt.missions.grace.settings import GraceSettings
+    from torchfilt.missions.stages import Stages
+
+    starts = options.pop("outage_starts_h")
+    try:
+        settings = GraceSettings(**options, outage_starts_h=None if starts is None else tuple(starts))
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    if threads is not None:
+        torch.set_num_threads(threads)
+    if force:
+        Stages(folder / "stages").clear()
+
+    def say(line: str) -> None:
+        if not quiet:
+            print(line, flush=True)
+
+    run(settings, out=folder, figures=figures, say=say, progress=not quiet)
 
 
 def _fail(error: Exception, debug: bool, code: int) -> int:

@@ -2,18 +2,20 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.history import History
 from torchfilt.missions.grace.data import MU_M3_S2, build_data, nominal_law, residual
 from torchfilt.missions.grace.learning import J2, POINT_MASS, POTENTIAL, learn_potential, nominal_dynamics
 from torchfilt.missions.grace.prediction import gains, held_out_starts, predict_from, prediction_errors
 from torchfilt.missions.grace.settings import GraceSettings
 from torchfilt.missions.grace.tracking import (
+    Case,
+    Tracked,
     bias_of_record,
     chi_square_band,
     make_filter,
@@ -21,7 +23,7 @@ from torchfilt.missions.grace.tracking import (
     simulate_case,
     track,
 )
-from torchfilt.types import FilterState, StepInfo
+from torchfilt.missions.stages import Stages
 
 FOLDER = str(Path(__file__).parents[2] / "data" / "grace_2010")
 SMALL = GraceSettings(
@@ -156,11 +158,7 @@ def test_range_is_the_record_and_outages_are_empty(data):
 
 def test_filters_with_learned_dynamics_track_better(data, dynamics):
     case = simulate_case(data, SMALL, "kband")
-    scores, histories = {}, {}
-    for name in ("nominal-ukf", "gp-ukf"):
-        histories[name], milliseconds = track(name, case, dynamics, SMALL)
-        scores[name] = score(histories[name], case, SMALL)
-        assert milliseconds > 0 and bool(histories[name].diagnostics.ok.all())
+    scores = {name: score(track(name, case, dynamics, SMALL), case, SMALL) for name in ("nominal-ukf", "gp-ukf")}
     nominal, learned = scores["nominal-ukf"], scores["gp-ukf"]
     # In the orbital plane the range and the dynamics rule; across, angles of 65 m do, whatever the dynamics.
     assert learned["in_plane_rmse_m"] < nominal["in_plane_rmse_m"] / 2
@@ -169,6 +167,7 @@ def test_filters_with_learned_dynamics_track_better(data, dynamics):
     assert learned["position_rmse_m"] < 15
     assert learned["log_likelihood"] > nominal["log_likelihood"] + 50
     assert 1 < learned["nees"] < 9
+    assert learned["ms_per_step"] > 0 and learned["ess"] is None
     json.dumps(scores)
 
 
@@ -177,14 +176,49 @@ def test_particle_filter_is_the_gaussian_filter_here(data, dynamics):
     its own noise."""
     short = GraceSettings(folder=FOLDER, degree=20, tracking_hours=1, runs=3, particles=60, settle_minutes=20)
     case = simulate_case(data, short, "radar")
-    upf, _ = track("mf-upf", case, dynamics, short)
-    ukf, _ = track("gp-ukf", case, dynamics, short)
+    upf, ukf = (track(name, case, dynamics, short) for name in ("mf-upf", "gp-ukf"))
     settled = slice(20, None)
     deviation = ukf.covariance[settled].diagonal(dim1=-2, dim2=-1).sqrt()
     apart = (upf.mean - ukf.mean)[settled] / deviation
     assert float(apart.square().mean().sqrt()) < 0.6
-    again, _ = track("mf-upf", case, dynamics, short)
-    assert torch.equal(again.mean, upf.mean)
+    assert upf.ess.shape == (60, 3) and 10 < upf.ess[settled].mean() < 60
+    assert torch.equal(track("mf-upf", case, dynamics, short).mean, upf.mean)
+
+
+def test_kept_results_are_found_again_by_the_same_settings_only(data, dynamics, tmp_path):
+    short = replace(SMALL, tracking_hours=1, settle_minutes=20, outage_starts_h=())
+    case, stages = simulate_case(data, short, "kband"), Stages(tmp_path)
+    first = track("gp-ukf", case, dynamics, short, stages=stages)
+    # Without dynamics nothing can be computed: this is read.
+    again = track("gp-ukf", case, {}, short, stages=stages)
+    for one, other in zip(first, again, strict=True):
+        assert torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
+    assert (
+        track("gp-ukf", case, {}, replace(short, particles=99, settle_minutes=30), stages=stages).cpu_s == first.cpu_s
+    )
+    changes = {"seed": 1, "runs": 4, "degree": 21, "bias_sd_m": 0.2, "range_sd_m": 0.02, "outage_starts_h": (0.1,)}
+    for name, value in changes.items():
+        with pytest.raises(KeyError):
+            track("gp-ukf", case, {}, replace(short, **{name: value}), stages=stages)
+    # A damaged file is told and replaced.
+    told = []
+    path = next(tmp_path.glob("gp-ukf-kband-*.npz"))
+    path.write_bytes(path.read_bytes()[:-1])
+    mended = track("gp-ukf", case, dynamics, short, stages=Stages(tmp_path, told.append))
+    assert torch.equal(mended.mean, first.mean) and "truncated or altered" in told[0]
+
+
+def test_learned_laws_are_kept(data, tmp_path):
+    """The potential's controls and the phase GP come back to the bit; another degree is learned anew."""
+    small = replace(SMALL, degree=6, training_hours=3)
+    stages = Stages(tmp_path)
+    first = learn_potential(data, small, stages)
+    nothing = data._replace(relative=data.relative * torch.nan)
+    again = learn_potential(nothing, small, stages)
+    assert torch.equal(first.controls, again.controls) and first.training == again.training
+    x, u = data.states[:3], first.controls[:3]
+    assert torch.equal(first.law(x, u, 60.0).covariance, again.law(x, u, 60.0).covariance)
+    assert not torch.equal(learn_potential(data, replace(small, degree=7), stages).controls, first.controls)
 
 
 def test_score_of_known_errors():
@@ -194,12 +228,10 @@ def test_score_of_known_errors():
     mean[10:, 0] = torch.tensor([3.0, 0.0, 4.0, 0.3, 0.0, 0.4])
     mean[10:, 1] = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.1, 0.0])
     mean[:10] = 1e6  # not settled
-    factor = torch.diag(torch.tensor([2.0] * 3 + [0.2] * 3, dtype=torch.float64)).expand(steps, 2, 6, 6)
-    ones = torch.ones(steps, 2, dtype=torch.float64)
-    info = StepInfo(ones, ones.bool(), nis=ones)
-    history = History(mean, info, FilterState(None, steps, 0), "linearized", beliefs=Gaussian(mean, factor))
-    case = simulate_case_of(truth)
-    found = score(history, case, settings)
+    covariance = torch.diag(torch.tensor([4.0] * 3 + [0.04] * 3, dtype=torch.float64)).expand(steps, 2, 6, 6)
+    tracked = Tracked(mean, covariance, torch.ones(steps, 2, dtype=torch.float64), None, 1.2)
+    case = Case("radar", torch.nn.Identity(), truth, Gaussian(truth[0], torch.eye(6)), truth, 2, [])
+    found = score(tracked, case, settings)
     assert found["position_rmse_m"] == pytest.approx(13**0.5)
     assert found["velocity_rmse_m_s"] == pytest.approx(0.13**0.5)
     assert found["position_rmse_sd_m"] == pytest.approx((5 - 1) / 2**0.5)
@@ -207,13 +239,10 @@ def test_score_of_known_errors():
     assert found["in_plane_rmse_m"] == pytest.approx(5**0.5)
     assert found["nees"] == pytest.approx((25 / 4 + 25 / 4 + 1 / 4 + 1 / 4) / 2)
     assert found["nees_inside_band"] == 1.0
+    alone = tracked._replace(mean=mean[:, :1], covariance=covariance[:, :1])
+    assert score(alone, case._replace(runs=1), settings)["position_rmse_sd_m"] is None
+    assert found["ms_per_step"] == pytest.approx(10.0)
     assert found["log_likelihood"] == 60 and found["ess"] is None and "bias" not in found
-
-
-def simulate_case_of(truth):
-    from torchfilt.missions.grace.tracking import Case
-
-    return Case("radar", torch.nn.Identity(), truth, Gaussian(truth[0], torch.eye(6)), truth, 2, [])
 
 
 def test_chi_square_band_holds_95_percent():
@@ -233,7 +262,7 @@ def test_chi_square_band_holds_95_percent():
         ({"training_hours": 2.0}, "training_hours must be whole steps, at least 3 h, got 2"),
         ({"training_hours": 21.0}, "training_hours must leave 4 h"),
         ({"training_hours": 12.0, "tracking_hours": 13.0}, "room for tracking_hours, got 12.0 and 13.0"),
-        ({"runs": 1}, "runs must be at least 2, got 1"),
+        ({"runs": 0}, "runs must be at least 1, got 0"),
         ({"degree": 1}, "degree must be at least 2"),
         ({"range_sd_m": 0.0}, "range_sd_m must be positive, got 0"),
         ({"prior_sd_m": math.nan}, "prior_sd_m must be positive, got nan"),

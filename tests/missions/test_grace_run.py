@@ -2,8 +2,11 @@
 
 import importlib.util
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import fields
 from pathlib import Path
 
@@ -49,40 +52,73 @@ def test_every_setting_has_an_option_with_its_default(script):
     defaults = GraceSettings()
     for field in fields(GraceSettings):
         assert options[field.name] == getattr(defaults, field.name), field.name
-    own = {"config", "out", "force", "figures", "threads", "quiet", "debug"}
+    own = {"config", "out", "force", "resume", "figures", "threads", "quiet", "debug"}
     assert set(options) - own == {field.name for field in fields(GraceSettings)}
 
 
 def test_wrong_use_and_failures_have_their_exit_codes(script, tmp_path, capsys):
-    assert script.main(["--runs", "1", "--out", str(tmp_path / "a")]) == 2
-    assert capsys.readouterr().err == "run_grace.py: runs must be at least 2, got 1\n"
-    (tmp_path / "metrics.json").write_text("{}")
+    assert script.main(["--runs", "0", "--out", str(tmp_path / "a")]) == 2
+    assert capsys.readouterr().err == "run_grace.py: runs must be at least 1, got 0\n"
+    (tmp_path / "settings.json").write_text("{}")
     assert script.main(["--out", str(tmp_path)]) == 2
-    assert "give --force or another --out" in capsys.readouterr().err
-    assert (tmp_path / "metrics.json").read_text() == "{}"
-    assert script.main(["--out", str(tmp_path / "metrics.json")]) == 2
+    assert "--resume goes on with it, --force overwrites it" in capsys.readouterr().err
+    assert script.main(["--out", str(tmp_path), "--resume", "--force"]) == 2
+    assert "give one of them" in capsys.readouterr().err
+    assert (tmp_path / "settings.json").read_text() == "{}"
+    assert script.main(["--out", str(tmp_path / "settings.json")]) == 2
     assert "not a folder" in capsys.readouterr().err
     assert script.main(["--folder", str(tmp_path), "--out", str(tmp_path / "b")]) == 1
     assert "grca_truth.csv.gz" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="runs must be at least 2"):
-        script.main(["--runs", "1", "--out", str(tmp_path / "a"), "--debug"])
+    with pytest.raises(script.UsageError, match="runs must be at least 1"):
+        script.main(["--runs", "0", "--out", str(tmp_path / "a"), "--debug"])
+
+
+SMALL = ["--folder", FOLDER, "--degree", "8", "--training-hours", "3", "--tracking-hours", "3", "--runs", "2"]
+SMALL += ["--particles", "12"]
 
 
 @pytest.mark.slow
-def test_small_run_repeats_itself_and_fills_its_folder(script, tmp_path, capsys):
-    arguments = ["--folder", FOLDER, "--degree", "8", "--training-hours", "3", "--tracking-hours", "3", "--runs", "2"]
-    arguments += ["--particles", "12"]
-    assert script.main([*arguments, "--out", str(tmp_path / "first"), "--quiet"]) == 0
+def test_small_run_fills_its_folder_and_repeats_itself(script, tmp_path, capsys):
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert script.main([*SMALL, "--out", str(first), "--quiet"]) == 0
     assert capsys.readouterr().out == ""
-    assert {path.stem for path in (tmp_path / "first" / "figures").glob("*.png")} == FIGURES
-    assert (tmp_path / "first" / "two-body-phase-gp" / "gp.npz").is_file()
+    assert {path.stem for path in (first / "figures").glob("*.png")} == FIGURES
+    assert "gp-ukf" in (first / "table.txt").read_text()
+    metrics = json.loads((first / "metrics.json").read_text())
+    assert metrics["seeds"] == [0] and metrics["versions"]["torch"]
+    assert metrics["grace"]["settings"]["degree"] == 8
     # A run's settings make the same run.
-    config = str(tmp_path / "first" / "settings.json")
-    assert script.main(["--config", config, "--out", str(tmp_path / "second"), "--quiet", "--figures", "false"]) == 0
-    assert not (tmp_path / "second" / "figures").exists()
-    results = [json.loads((tmp_path / name / "metrics.json").read_text())["grace"] for name in ("first", "second")]
-    first, second = (without_times(result) for result in results)
-    assert first == second and first["settings"]["degree"] == 8
+    config = str(first / "settings.json")
+    assert script.main(["--config", config, "--out", str(second), "--quiet", "--figures", "false"]) == 0
+    assert not (second / "figures").exists()
+    again = json.loads((second / "metrics.json").read_text())
+    assert without_times(again) == without_times(metrics)
+    # Resumed, all parts are found: even their times are the same.
+    assert script.main([*SMALL, "--out", str(second), "--resume", "--figures", "false"]) == 0
+    resumed = json.loads((second / "metrics.json").read_text())["grace"]
+    assert resumed.pop("seconds") < again["grace"].pop("seconds")
+    assert resumed == again["grace"]
+    assert "held-out hours" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_run_goes_on(tmp_path, number):
+    line = [sys.executable, str(SCRIPT), *SMALL, "--out", str(tmp_path), "--quiet", "--figures", "false"]
+    process = subprocess.Popen(line, stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    begin = time.monotonic()
+    while not list((tmp_path / "stages").glob("*phase-gp*.npz")) and time.monotonic() - begin < 120:
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, message = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert "go on with --resume" in message
+    assert not (tmp_path / "metrics.json").exists()
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "stages").glob("*.npz")}
+    done = subprocess.run([*line, "--resume"], capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "metrics.json").is_file()
+    assert kept and all(path.stat().st_mtime_ns == when for path, when in kept.items())
 
 
 def without_times(value):

@@ -22,9 +22,12 @@ _HOMES = {
     "predict_from": "prediction",
     "prediction_errors": "prediction",
     "Case": "tracking",
+    "Tracked": "tracking",
+    "score": "tracking",
     "simulate_case": "tracking",
     "track": "tracking",
     "run": "campaign",
+    "table": "campaign",
 }
 
 __all__ = sorted(_HOMES)

@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchfilt.history import History
 from torchfilt.learning.figures import new_axes, save_figure
 from torchfilt.missions.grace.prediction import Growth
 from torchfilt.missions.grace.settings import GraceSettings
-from torchfilt.missions.grace.tracking import Case
+from torchfilt.missions.grace.tracking import Case, Tracked
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,19 +24,19 @@ def draw(
     folder: str | Path,
     settings: GraceSettings,
     growth: dict[str, Growth],
-    cases: dict[str, tuple[Case, dict[str, History]]],
+    cases: dict[str, tuple[Case, dict[str, Tracked]]],
     recorded_bias_m: float,
 ) -> list[Path]:
     """Write all figures; returns their paths."""
     folder = Path(folder)
     paths = [_prediction(folder / "prediction.png", growth)]
-    for name, (case, histories) in cases.items():
+    for name, (case, found) in cases.items():
         for quantity in ("position", "velocity"):
-            paths.append(_errors(folder / f"{quantity}_{name}.png", quantity, settings, case, histories))
-    case, histories = cases["kband"]
-    paths.append(_bias(folder / "bias.png", settings, histories, recorded_bias_m))
+            paths.append(_errors(folder / f"{quantity}_{name}.png", quantity, settings, case, found))
+    case, found = cases["kband"]
+    paths.append(_bias(folder / "bias.png", settings, found, recorded_bias_m))
     if case.outages:
-        paths.append(_outages(folder / "outages.png", settings, case, histories))
+        paths.append(_outages(folder / "outages.png", settings, case, found))
     return paths
 
 
@@ -57,19 +56,19 @@ def _hours(settings: GraceSettings) -> Any:
     return settings.training_hours + np.arange(1, settings.tracking_steps + 1) * settings.step_s / 3600
 
 
-def _errors(path: Path, quantity: str, settings: GraceSettings, case: Case, histories: dict[str, History]) -> Path:
+def _errors(path: Path, quantity: str, settings: GraceSettings, case: Case, found: dict[str, Tracked]) -> Path:
     """Errors of the first run with the learned filter's three-sigma band."""
     title = {"kband": "K-band range and angles", "radar": "simulated range and angles"}[case.name]
     figure, axes = new_axes(3, f"{quantity} error: {title}")
     hours, shift = _hours(settings), 0 if quantity == "position" else 3
     for k, ax in enumerate(axes):
         column = shift + k
-        deviation = _deviation(histories["gp-ukf"], column)
+        deviation = _deviation(found["gp-ukf"], column)
         ax.fill_between(hours, -3 * deviation, 3 * deviation, color="0.85", lw=0, label="gp-ukf, 3 sigma")
         settled = deviation[settings.settle_steps :]
         limit = 0.0
-        for name, history in histories.items():
-            error = (history.mean[:, 0, column] - case.truth[:, column]).numpy()
+        for name, own in found.items():
+            error = (own.mean[:, 0, column] - case.truth[:, column]).numpy()
             ax.plot(hours, error, color=_COLOURS[name], lw=1, label=name)
             limit = max(limit, float(np.abs(error[settings.settle_steps :]).max()))
         limit = 1.2 * max(limit, 3 * float(settled.max()))
@@ -81,19 +80,18 @@ def _errors(path: Path, quantity: str, settings: GraceSettings, case: Case, hist
     return path
 
 
-def _deviation(history: History, column: int) -> Any:
-    variance = history.covariance[..., column, column]
-    return variance.expand(history.mean.shape[:-1])[:, 0].sqrt().numpy()
+def _deviation(tracked: Tracked, column: int) -> Any:
+    return tracked.covariance[:, 0, column, column].sqrt().numpy()
 
 
-def _bias(path: Path, settings: GraceSettings, histories: dict[str, History], recorded_bias_m: float) -> Path:
+def _bias(path: Path, settings: GraceSettings, found: dict[str, Tracked], recorded_bias_m: float) -> Path:
     figure, axes = new_axes(1, "bias of the K-band range")
     hours, ax = _hours(settings), axes[0]
-    deviation = _deviation(histories["gp-ukf"], 6)
-    middle = histories["gp-ukf"].mean[:, 0, 6].numpy()
+    deviation = _deviation(found["gp-ukf"], 6)
+    middle = found["gp-ukf"].mean[:, 0, 6].numpy()
     ax.fill_between(hours, middle - 3 * deviation, middle + 3 * deviation, color="0.85", lw=0, label="gp-ukf, 3 sigma")
-    for name, history in histories.items():
-        ax.plot(hours, history.mean[:, 0, 6].numpy(), color=_COLOURS[name], lw=1, label=name)
+    for name, own in found.items():
+        ax.plot(hours, own.mean[:, 0, 6].numpy(), color=_COLOURS[name], lw=1, label=name)
     ax.axhline(recorded_bias_m, color="k", ls=":", label="range minus precise orbits, mean")
     ax.set_xlabel("hour of the day")
     ax.set_ylabel("m")
@@ -102,15 +100,15 @@ def _bias(path: Path, settings: GraceSettings, histories: dict[str, History], re
     return path
 
 
-def _outages(path: Path, settings: GraceSettings, case: Case, histories: dict[str, History]) -> Path:
+def _outages(path: Path, settings: GraceSettings, case: Case, found: dict[str, Tracked]) -> Path:
     figure, axes = new_axes(2, f"{settings.outage_minutes:g} minutes without any measurement")
     hours = _hours(settings)
     parts = (slice(0, 2), slice(0, 3))
     for ax, part, label in zip(axes, parts, ("radial and along, m", "position, m"), strict=True):
         for rows in case.outages:
             ax.axvspan(hours[rows.start - 1], hours[rows.stop - 1], color="0.9", lw=0)
-        for name, history in histories.items():
-            error = history.mean[:, case.runs :, :6] - case.truth.unsqueeze(1)
+        for name, own in found.items():
+            error = own.mean[:, case.runs :, :6] - case.truth.unsqueeze(1)
             rms = error[..., part].square().sum(-1).mean(1).sqrt().numpy()
             ax.semilogy(hours, rms, color=_COLOURS[name], lw=1, label=name)
         ax.set_ylabel(f"rms error, {label}")

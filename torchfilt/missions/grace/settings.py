@@ -4,6 +4,9 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+# Raised when the same settings come to mean other numbers.
+_VERSION = 1
+
 
 @dataclass(frozen=True)
 class GraceSettings:
@@ -64,7 +67,7 @@ class GraceSettings:
                 "training_hours must leave 4 h of the day for tests and room for tracking_hours, got "
                 f"{self.training_hours} and {self.tracking_hours}"
             )
-        for name, least in (("degree", 2), ("runs", 2), ("particles", 10), ("seed", 0)):
+        for name, least in (("degree", 2), ("runs", 1), ("particles", 10), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not 0 <= self.settle_minutes < 60 * self.tracking_hours:
@@ -108,6 +111,11 @@ class GraceSettings:
             hours = tuple(h for h in (self.tracking_hours / 3, self.tracking_hours * 3 / 4) if self._has_room(h))
         starts = [round(h * 3600 / self.step_s) for h in hours]
         return [range(start, start + length) for start in starts]
+
+    def recipe(self, *more: str) -> dict[str, Any]:
+        """What a kept result depends on: the data, the training, and the options named."""
+        own = self.to_dict()
+        return {"version": _VERSION} | {name: own[name] for name in ("folder", "training_hours", "step_s", *more)}
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready values."""

@@ -3,16 +3,17 @@
 import time
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchfilt.filters.gaussian import UnscentedKalmanFilter
 from torchfilt.filters.particle import UnscentedParticleFilter
 from torchfilt.gaussian import Gaussian
-from torchfilt.history import History
 from torchfilt.missions.grace.data import GraceData
 from torchfilt.missions.grace.learning import J2, POTENTIAL, Dynamics
 from torchfilt.missions.grace.settings import GraceSettings
+from torchfilt.missions.stages import Arrays, Stages
 from torchfilt.model import StateSpaceModel
 from torchfilt.models.relative_motion import BiasedRanging, RendezvousRadar, WithConstant
 from torchfilt.noise import NoiseSource
@@ -22,7 +23,24 @@ FILTERS = ("nominal-ukf", "gp-ukf", "mf-upf")
 CaseName = Literal["kband", "radar"]
 # Purposes of random numbers, keys of the noise source.
 _PRIOR, _ANGLES, _RANGE = 0, 1, 2
+# Options that a filter's numbers depend on, beside the training's.
+_MATTERS = (
+    *("tracking_hours", "degree", "runs", "seed", "range_sd_m", "radar_range_sd_m", "angle_3sigma_deg", "prior_sd_m"),
+    *("prior_sd_m_s", "bias_sd_m", "outage_minutes", "outage_starts_h"),
+)
 _AXES = ("radial", "along", "across")
+
+
+class Tracked(NamedTuple):
+    """What a filter found: mean (t, rows, d), covariance (t, rows, d, d), log_likelihood (t, rows), ess (t, rows) or
+    None; cpu_s of all steps and rows together.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    log_likelihood: Tensor
+    ess: Tensor | None
+    cpu_s: float
 
 
 class Case(NamedTuple):
@@ -104,33 +122,59 @@ def _dynamics_of(name: str, dynamics: dict[str, Dynamics]) -> Dynamics:
     return dynamics[J2 if name == "nominal-ukf" else POTENTIAL]
 
 
-@torch.no_grad()
 def track(
-    name: str, case: Case, dynamics: dict[str, Dynamics], settings: GraceSettings, *, progress: bool = False
-) -> tuple[History, float]:
-    """Run one filter through the tracking hours; returns its history and milliseconds a step of one run."""
+    name: str,
+    case: Case,
+    dynamics: dict[str, Dynamics],
+    settings: GraceSettings,
+    *,
+    stages: Stages | None = None,
+    progress: bool = False,
+) -> Tracked:
+    """Run one filter through the tracking hours, or read what ``stages`` kept of the same run."""
+    recipe = settings.recipe(*_MATTERS, *(("particles",) if name == "mf-upf" else ()))
+    arrays = (stages or Stages(None)).get(
+        f"{name}-{case.name}", recipe, lambda: _run_filter(name, case, dynamics, settings, progress)
+    )
+    mean, covariance, log_likelihood = (torch.from_numpy(arrays[key]) for key in ("mean", "covariance", "evidence"))
+    ess = torch.from_numpy(arrays["ess"]) if "ess" in arrays else None
+    return Tracked(mean, covariance, log_likelihood, ess, float(arrays["cpu_s"]))
+
+
+@torch.no_grad()
+def _run_filter(
+    name: str, case: Case, dynamics: dict[str, Dynamics], settings: GraceSettings, progress: bool
+) -> Arrays:
     first, count = settings.training_steps, settings.tracking_steps
     controls = _dynamics_of(name, dynamics).controls[first : first + count]
     filt = make_filter(name, case, dynamics, settings)
-    begin = time.perf_counter()
+    begin = time.process_time()
     history = filt(case.measurements, controls, settings.step_s, seed=settings.seed, progress=progress)
-    elapsed = time.perf_counter() - begin
-    return history, 1e3 * elapsed / (count * case.measurements.shape[1])
+    seconds = time.process_time() - begin
+    size = history.mean.shape[-1]
+    arrays = {
+        "mean": history.mean,
+        "covariance": history.covariance.expand(*history.mean.shape, size).contiguous(),
+        "evidence": history.diagnostics.log_likelihood,
+    }
+    if history.diagnostics.ess is not None:
+        arrays["ess"] = history.diagnostics.ess
+    return {key: value.numpy() for key, value in arrays.items()} | {"cpu_s": np.array(seconds)}
 
 
-def score(history: History, case: Case, settings: GraceSettings) -> dict[str, Any]:
+def score(tracked: Tracked, case: Case, settings: GraceSettings) -> dict[str, Any]:
     """Errors against the precise orbits from the settled part on; JSON-ready.
 
     Returns:
         Root mean squares of 3-D position and velocity over time and runs, their standard deviation over runs, the same
         by axis; ``nees`` of the six numbers (6 is ideal) with the share of epochs at which its mean over runs lies in
         its 95 % chi-square band (runs share the dynamics' error and the K-band record, so a sound filter may leave the
-        band more often); ESS over particles; outages and bias for "kband".
+        band more often); ESS; ms_per_step, CPU time of a step of one run; outages and bias for "kband".
     """
     settled = slice(settings.settle_steps, None)
     plain = slice(0, case.runs)
-    error = history.mean[..., :6] - case.truth.unsqueeze(1)
-    covariance = history.covariance[..., :6, :6].expand(*error.shape, 6)
+    error = tracked.mean[..., :6] - case.truth.unsqueeze(1)
+    covariance = tracked.covariance[..., :6, :6]
     some, inside = error[settled, plain], covariance[settled, plain]
     nees = _nees(some, inside)
     low, high = chi_square_band(6, case.runs)
@@ -145,8 +189,9 @@ def score(history: History, case: Case, settings: GraceSettings) -> dict[str, An
         "nees": float(nees.mean()),
         "nees_band_95": [low, high],
         "nees_inside_band": float(((mean >= low) & (mean <= high)).double().mean()),
-        "log_likelihood": float(history.diagnostics.log_likelihood[:, plain].sum(0).mean()),
-        "ess": None if history.diagnostics.ess is None else float(history.diagnostics.ess[settled, plain].mean()),
+        "log_likelihood": float(tracked.log_likelihood[:, plain].sum(0).mean()),
+        "ess": None if tracked.ess is None else float(tracked.ess[settled, plain].mean()),
+        "ms_per_step": 1e3 * tracked.cpu_s / tracked.log_likelihood.numel(),
     }
     if case.name == "kband":
         last = [rows.stop - 1 for rows in case.outages]
@@ -158,7 +203,7 @@ def score(history: History, case: Case, settings: GraceSettings) -> dict[str, An
                 "in_plane_rmse_m": _rms(end[..., :2]),
                 "nees": float(_nees(end, covariance[last, case.runs :]).mean()),
             }
-        bias, variance = history.mean[-1, plain, 6], history.covariance[-1, plain, 6, 6]
+        bias, variance = tracked.mean[-1, plain, 6], tracked.covariance[-1, plain, 6, 6]
         result["bias"] = {"estimate_m": float(bias.mean()), "sd_m": float(variance.mean().sqrt())}
     return result
 
@@ -188,6 +233,6 @@ def _rms(error: Tensor) -> float:
     return float(error.square().sum(-1).mean().sqrt())
 
 
-def _spread(error: Tensor) -> float:
-    """Standard deviation over runs of each run's root mean square."""
-    return float(error.square().sum(-1).mean(0).sqrt().std())
+def _spread(error: Tensor) -> float | None:
+    """Standard deviation over runs of each run's root mean square; None of one run."""
+    return float(error.square().sum(-1).mean(0).sqrt().std()) if error.shape[1] > 1 else None
