@@ -27,9 +27,18 @@ def inputs(rows=3, seed=0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("missing", ["none", "shared", "rows"])
-@pytest.mark.parametrize("form", ["bent", "linear"])
-@pytest.mark.parametrize("rule", RULES)
+# The compiler of torch 2.13 calls what torch 2.13 deprecates.
+@pytest.mark.filterwarnings("ignore:.*torch._prims_common.check.* is deprecated:FutureWarning")
+@pytest.mark.parametrize(
+    ("rule", "form", "missing"),
+    [
+        ("taylor", "linear", "none"),
+        ("taylor", "bent", "rows"),
+        ("unscented", "bent", "none"),
+        ("unscented", "linear", "rows"),
+        ("unscented-negative-centre", "bent", "rows"),
+    ],
+)
 def test_compiled_step_equals_the_eager_one(rule, form, missing):
     """One graph without breaks, over a chain of steps with other numbers in them: no second compilation."""
     torch.compiler.reset()
@@ -47,10 +56,8 @@ def test_compiled_step_equals_the_eager_one(rule, form, missing):
     one = two = start._replace(scale_tril=start.scale_tril.expand(3, 2, 2).contiguous())
     for k in range(3):
         y, u = inputs(seed=k)
-        if missing != "none":
-            y[:, 0] = torch.nan
         if missing == "rows":
-            y[1] = 0.5
+            y[0, 0] = y[1] = torch.nan
         dt = torch.full((3, 1), 0.3 + 0.1 * k, dtype=torch.float64)
         counted(one, y, u, dt, None, missing)
         one, found = compiled(one, y, u, dt, None, missing)
@@ -59,8 +66,8 @@ def test_compiled_step_equals_the_eager_one(rule, form, missing):
         torch.testing.assert_close(one.scale_tril, two.scale_tril, rtol=0, atol=1e-10)
         torch.testing.assert_close(found.log_likelihood, expected.log_likelihood, rtol=0, atol=1e-10)
         assert torch.equal(found.ok, expected.ok)
-    # The covariance becomes a row's own or stays shared with the first step; after that nothing is compiled again.
-    assert len(graphs) <= 2, len(graphs)
+    # The first factor is contiguous, later ones are a block of a larger matrix: two graphs, then no more.
+    assert len(graphs) <= 2
 
 
 @pytest.mark.parametrize("missing", ["none", "rows"])
