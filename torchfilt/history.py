@@ -103,6 +103,8 @@ class History:
             if belief is not None:
                 named = belief._asdict()
                 parts |= {f"{prefix}.{name}": named[name] for name in named if isinstance(named[name], Tensor)}
+        if isinstance(final, Particles):  # made on another way than from log_weights they differ in the last bit
+            parts["final.weights"] = final.weights
         arrays: dict[str, Any] = {n: value.detach().cpu().numpy() for n, value in parts.items() if value is not None}
         arrays["head"] = np.frombuffer(json.dumps(head, sort_keys=True).encode(), dtype=np.uint8)
         stream = io.BytesIO()
@@ -188,7 +190,9 @@ def _belief(tensors: dict[str, Tensor], prefix: str, head: dict[str, Any], space
     own = {name.removeprefix(f"{prefix}."): value for name, value in tensors.items() if name.startswith(f"{prefix}.")}
     if head["belief"] == "gaussian":
         return Gaussian(own["mean"], own["scale_tril"], space, bool(head["is_diagonal"]))
-    return Particles(own["x"], own["log_weights"], own.get("scale_tril"), space)
+    log_weights, weights = own["log_weights"], own.get("weights")
+    held = None if weights is None else (log_weights, weights)
+    return Particles(own["x"], log_weights, own.get("scale_tril"), space, held)
 
 
 @dataclass
