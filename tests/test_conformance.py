@@ -255,8 +255,14 @@ PARTICLE = {
 }
 
 
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("name", GAUSSIAN)
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        pytest.param(name, model, marks=pytest.mark.slow if (name[-8:], model) == ("iterated", "turning") else ())
+        for name in GAUSSIAN
+        for model in MODELS
+    ],
+)
 def test_gaussian_filters(name, model):
     laws, ys = MODELS[model]
     check_filter(GAUSSIAN[name](laws), ys)

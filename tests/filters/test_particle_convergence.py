@@ -30,7 +30,10 @@ def rms_errors(make, n, runs, seed):
     return np.sqrt((mean**2).mean()), np.sqrt((covariance**2).mean())
 
 
-@pytest.mark.parametrize("form", FORMS)
+SLOW = ("bank", "bank-redrawn")
+
+
+@pytest.mark.parametrize("form", [pytest.param(f, marks=pytest.mark.slow if f in SLOW else ()) for f in FORMS])
 def test_order_of_convergence_is_one_half(form):
     """Slope of log error over log n within 0.1 of -1/2.
 

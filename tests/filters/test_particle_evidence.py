@@ -106,7 +106,7 @@ def test_missing_components_are_integrated_out():
     patterns = np.tile(ys, (3, 1, 1))
     patterns[0, 1, 0], patterns[1, 1, 1], patterns[2, 1] = np.nan, np.nan, np.nan
     exact = [particle_oracle.kalman(two, row).log_likelihood.sum() for row in patterns]
-    runs = 1500
+    runs = 1000
     data = tensor(patterns).movedim(0, 1).repeat_interleave(runs, 1)
     model = state_space(two)
     filters = [
@@ -118,7 +118,7 @@ def test_missing_components_are_integrated_out():
         found = filter(data, seed=15, record="mean").log_likelihood.split(runs)
         for row, answer in zip(found, exact, strict=True):
             score, mean, error = bias_score(row, answer)
-            assert error < 0.015 and abs(score) < Z, (filter.proposal, mean, error)
+            assert error < 0.018 and abs(score) < Z, (filter.proposal, mean, error)
 
 
 class StudentStep(torch.nn.Module):
@@ -257,6 +257,7 @@ def test_literal_form_counts_uncertainty_twice():
     assert np.trace(found) > 1.8 * np.trace(exact.covariance[-1])
 
 
+@pytest.mark.slow
 def test_literal_joint_form_is_worse_than_exact_too():
     """With the papers' joint ratio the covariance is more than twice the exact one."""
     ys, exact = series(4)

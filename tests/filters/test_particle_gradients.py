@@ -91,7 +91,7 @@ def test_gradient_of_the_evidence_is_unbiased(form):
     assert score.abs().max() < Z, score
 
 
-@pytest.mark.parametrize("form", ["bootstrap", "bootstrap-adaptive", "joint"])
+@pytest.mark.parametrize("form", ["bootstrap", "bootstrap-adaptive", pytest.param("joint", marks=pytest.mark.slow)])
 def test_pathwise_gradient_alone_would_be_biased(form):
     of_z, _ = gradients(FORMS[form], 100, batches=20 if "bootstrap" in form else 60, pathwise=True)
     score, _ = against_score(of_z)

@@ -149,6 +149,7 @@ print(digest.hexdigest())
 """
 
 
+@pytest.mark.slow
 def test_one_thread_and_two_give_the_same_bits():
     """Large clouds, so that sums are big enough to be shared out."""
     paths = [p for p in sys.path if p.endswith(("tests", "filters"))]
