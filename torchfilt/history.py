@@ -233,7 +233,7 @@ class Recorder:
 
     def finish(self, final: FilterState[Any]) -> History:
         """The history of all steps taken in."""
-        mean = torch.stack(self.means)
+        mean = _stack_rows(self.means)
         covariance = torch.stack(self.covariances) if self.covariances else None
         info = StepInfo(*(_stack([step[k] for step in self.infos]) for k in range(len(StepInfo._fields))))  # type: ignore[arg-type]
         beliefs: Gaussian | Particles | None = None
@@ -253,6 +253,13 @@ class Recorder:
                 clouds[0].space,
             )
         return History(mean, info, final, self.evidence, final.belief.space, beliefs, covariance)
+
+
+def _stack_rows(values: list[Tensor]) -> Tensor:
+    """Along time; rows that lie component by component in memory are copied as they lie."""
+    if values[0].dim() == 2 and values[0].stride(-2) == 1:
+        return torch.stack([value.mT for value in values]).mT
+    return torch.stack(values)
 
 
 def _stack(values: list[Tensor | None]) -> Tensor | None:

@@ -34,8 +34,24 @@ def triangularize(columns: Tensor) -> Tensor:
     mode = "reduced" if whole else "r"
     r = torch.linalg.qr(columns.mT, mode=mode).R
     diagonal = r.diagonal(dim1=-2, dim2=-1)
-    sign = torch.where(diagonal < 0, -torch.ones_like(diagonal), torch.ones_like(diagonal))
+    sign = torch.copysign(diagonal.new_ones(()), diagonal.detach())
     return (r * sign.unsqueeze(-1)).mT
+
+
+_BLOCK = 1024
+
+
+def steady_triangularize(columns: Tensor) -> Tensor:
+    """`triangularize` of many columns (*batch, e, k) in blocks: the same bits for any thread count.
+
+    LAPACK shares one long factorisation between threads, which then round differently; blocks are too short for that.
+    """
+    while columns.shape[-1] >= 2 * _BLOCK:
+        count = columns.shape[-1] // _BLOCK - 1  # the last block takes the rest, so that none is short
+        head, rest = columns[..., : count * _BLOCK], columns[..., count * _BLOCK :]
+        factors = triangularize(head.unflatten(-1, (count, _BLOCK)).movedim(-2, -3))
+        columns = torch.cat([factors.movedim(-3, -2).flatten(-2), triangularize(rest)], -1)
+    return triangularize(columns)
 
 
 def cholesky_downdate(factor: Tensor, vector: Tensor) -> Tensor:

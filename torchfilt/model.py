@@ -77,9 +77,17 @@ class StateSpaceModel(nn.Module):
         """Whether transition and observation are linear in the state with Gaussian noise and say so."""
         return hasattr(self.transition, "linear_form") and hasattr(self.observation, "linear_form")
 
-    def prior(self) -> Gaussian:
-        """The initial law by its first two moments."""
-        return as_gaussian(self.initial())
+    def prior(self, batch_shape: tuple[int, ...] | None = None) -> Gaussian:
+        """The initial law by its first two moments.
+
+        Raises:
+            ValueError: it has a batch of its own, which is not ``batch_shape``.
+        """
+        prior = as_gaussian(self.initial())
+        lead = prior.mean.shape[:-1]
+        if lead and batch_shape is not None and lead != torch.Size(batch_shape):
+            raise ValueError(f"the prior is for a batch of {tuple(lead)}, not {tuple(batch_shape)}")
+        return prior
 
 
 class InitialLaw(nn.Module):

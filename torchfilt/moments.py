@@ -61,6 +61,10 @@ class Taylor:
         linear_form = getattr(law, "linear_form", None)
         if linear_form is not None:
             matrix, offset, noise = linear_form(u, dt)
+            if 2 < matrix.dim() <= belief.mean.dim():  # one matrix a run meets several Gaussians a run
+                matrix = matrix.unsqueeze(-3)
+                offset = offset if offset is None or offset.dim() == 1 else offset.unsqueeze(-2)
+                noise = noise if noise.dim() == 2 else noise.unsqueeze(-3)
             mean = apply_factor(matrix, belief.mean)
             return Linearization(
                 mean if offset is None else mean + offset, matrix @ belief.factor(), None, noise, law_space(law)
@@ -82,9 +86,9 @@ class Taylor:
 class Quadrature(NamedTuple):
     """Nodes (s, e) for a standard normal with weights (s,) of the mean and of the covariance.
 
-    ``paired``: nodes are [centre, +c I, -c I], so slope and residual split without a matrix product; ``central`` is
-    then the centre's covariance weight and ``negative`` says whether its mean weight is below zero, both as plain
-    values, so that a compiled step does not branch on tensors.
+    ``paired``: nodes are [+c I, -c I], or these after a centre, so slope and residual split without a matrix product;
+    ``central`` is then the centre's covariance weight and ``negative`` says whether its mean weight is below zero, both
+    as plain values, so that a compiled step does not branch on tensors.
     """
 
     nodes: Tensor
@@ -119,14 +123,14 @@ class SigmaPoints:
 def _split_paired(rule: Quadrature, deviation: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """Rotate each +- pair of columns into its odd part (the slope, exactly) and its even part (the residual)."""
     size = rule.nodes.shape[-1]
-    weight, central = rule.covariance_weights[1], rule.central
-    centre, plus, minus = deviation.split([1, size, size], dim=-2)
+    weight, central = rule.covariance_weights[-1], rule.central
+    plus, minus = deviation[..., -2 * size : -size, :], deviation[..., -size:, :]
     half = torch.sqrt(weight / 2)
     slope = (half * (plus - minus)).mT
     even = half * (plus + minus)
     if central > 0:
-        even = torch.cat([even, central**0.5 * centre], -2)
-    negative = (-central) ** 0.5 * centre.squeeze(-2) if central < 0 else None
+        even = torch.cat([even, central**0.5 * deviation[..., :1, :]], -2)
+    negative = (-central) ** 0.5 * deviation[..., 0, :] if central < 0 else None
     return slope, even.mT, negative
 
 
@@ -194,7 +198,8 @@ def unscented(alpha: float = 1.0, beta: float = 0.0, kappa: float | None = None)
     """Unscented transform with 2e + 1 points.
 
     The default (alpha 1, beta 0, kappa max(3 - e, 1)) keeps every weight positive. Small alpha makes the central weight
-    negative; that is done by a Cholesky downdate, which can fail and then says so in the row's status.
+    negative; that is done by a Cholesky downdate, which can fail and then says so in the row's status. It also rounds
+    the mean by eps |x| / alpha^2: in float32 keep alpha near 1.
 
     Raises:
         ValueError: alpha is not positive.
@@ -224,8 +229,13 @@ def unscented(alpha: float = 1.0, beta: float = 0.0, kappa: float | None = None)
 @lru_cache(maxsize=1)
 def cubature() -> SigmaPoints:
     """Third-degree spherical-radial cubature with 2e points. Source: Arasaratnam and Haykin, IEEE TAC 54 (2009)."""
-    base = unscented(kappa=0.0)
-    return SigmaPoints("cubature", base.build)
+
+    def build(size: int) -> Quadrature:
+        eye = torch.eye(size, dtype=torch.float64) * size**0.5
+        weights = torch.full((2 * size,), 0.5 / size, dtype=torch.float64)
+        return Quadrature(torch.cat([eye, -eye]), weights, weights, True)
+
+    return SigmaPoints("cubature", build)
 
 
 @lru_cache(maxsize=16)
@@ -350,7 +360,8 @@ def _condition(
     innovation_factor, gain, posterior_factor = factor[..., :m, :m], factor[..., m:, :m], factor[..., m:, m:]
     z = whiten(innovation_factor, innovation)
     nis = z.square().sum(-1)
-    log_likelihood = -0.5 * nis - log_abs_diagonal(innovation_factor) - 0.5 * LOG_2PI * counted
+    constant = -0.5 * LOG_2PI * counted - log_abs_diagonal(innovation_factor)
+    log_likelihood = torch.sub(constant, nis, alpha=0.5)
     mean = prior.space.retract(prior.mean, apply_factor(gain, z))
     if observed is not None:  # rows without any measurement keep the prior to the bit
         seen = observed.any(-1)

@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.linalg import apply_factor
+from torchfilt.linalg import apply_factor, steady_triangularize
 from torchfilt.model import StateSpaceModel, as_gaussian, log_prob
 from torchfilt.moments import Missing
 from torchfilt.particles import Particles
-from torchfilt.proposals import steady_triangularize
 from torchfilt.types import StepNoise
 
 Step = Tensor | float | None

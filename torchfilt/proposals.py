@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.linalg import apply_factor, triangularize
+from torchfilt.linalg import apply_factor, steady_triangularize
 from torchfilt.model import Conditional, StateSpaceModel, as_gaussian, log_prob, sample
 from torchfilt.moments import Missing, Rule, predict, update
 from torchfilt.particles import Particles, uniform_log_weights
@@ -253,22 +253,6 @@ class Local:
         if factor.dim() == 2:  # shared by everyone: what particles carry has a row and a particle axis
             factor = factor.expand(*particles.x.shape[:-2], 1, -1, -1)
         return step._replace(scale_tril=factor, is_diagonal=False), law
-
-
-_BLOCK = 1024
-
-
-def steady_triangularize(columns: Tensor) -> Tensor:
-    """`torchfilt.linalg.triangularize` of many columns (*batch, e, k) in blocks: the same bits for any thread count.
-
-    LAPACK shares one long factorisation between threads, which then round differently; blocks are too short for that.
-    """
-    while columns.shape[-1] >= 2 * _BLOCK:
-        count = columns.shape[-1] // _BLOCK - 1  # the last block takes the rest, so that none is short
-        head, rest = columns[..., : count * _BLOCK], columns[..., count * _BLOCK :]
-        factors = triangularize(head.unflatten(-1, (count, _BLOCK)).movedim(-2, -3))
-        columns = torch.cat([factors.movedim(-3, -2).flatten(-2), triangularize(rest)], -1)
-    return triangularize(columns)
 
 
 def _equal_weights(x: Tensor, factor: Tensor | None, space: Space) -> Particles:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchfilt.particles import Particles
 from torchfilt.spaces import steady_sum
 
 
@@ -130,6 +131,19 @@ def ess_below(fraction: float, resampler: Resampler = systematic) -> Resampler:
 def never() -> Resampler:
     """No resampling at all: plain sequential importance sampling."""
     return ess_below(0.0)
+
+
+def by_component(particles: Particles) -> Particles:
+    """The same particles, component by component in memory: the order that `gather_particles` leaves.
+
+    Sums and products round by the order in memory, so a cloud that was just read from a file, or one whose neighbours
+    in the batch were resampled, must lie as any other does.
+    """
+    x = particles.x.movedim(-1, 0).contiguous().movedim(0, -1)
+    factor = particles.scale_tril
+    if factor is not None:
+        factor = factor.movedim((-2, -1), (0, 1)).contiguous().movedim((0, 1), (-2, -1))
+    return particles._replace(x=x, scale_tril=factor)
 
 
 def gather_particles(values: Tensor, ancestors: Tensor) -> Tensor:

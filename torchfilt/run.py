@@ -193,8 +193,9 @@ def _keep_memory(belief: Gaussian | Particles) -> None:
 
     glibc raises its thresholds when a large block is released; an empty block that is never touched costs nothing.
     """
-    if isinstance(belief, Particles) and belief.x.device.type == "cpu":
-        wanted = 16 * belief.x.numel() * belief.x.element_size()
+    largest = belief.x if isinstance(belief, Particles) else belief.mean
+    if largest.device.type == "cpu":
+        wanted = 16 * largest.numel() * largest.element_size()
         torch.empty(min(wanted, _LARGEST_BLOCK), dtype=torch.uint8)
 
 

@@ -124,3 +124,11 @@ def test_bad_arguments_are_named(arguments, words):
 def test_a_missing_time_step_is_named():
     with pytest.raises(ValueError, match="no time step"):
         ClohessyWiltshire(1e-3, 1e-9)(torch.ones(6))
+
+
+def test_held_matrices_follow_loaded_constants():
+    law, other = (ClohessyWiltshire(n, psd, dt_s=10.0) for n, psd in ((0.0011, 1e-9), (0.0012, 4e-9)))
+    law.load_state_dict(other.state_dict())
+    x = torch.ones(6, dtype=torch.float64)
+    ours, theirs = law(x, None, 10.0), other(x, None, 10.0)
+    assert torch.equal(ours.mean, theirs.mean) and torch.equal(ours.scale_tril, theirs.scale_tril)

@@ -146,7 +146,7 @@ def test_constants_pool_and_stay_diagonal():
 
 @pytest.mark.parametrize("arguments", [(0,), (1, -1.0)])
 def test_bad_constants_are_named(arguments):
-    with pytest.raises(ValueError, match=">= 0|at least 1"):
+    with pytest.raises(ValueError, match=r">= 0|at least 1"):
         WithConstant(TwoBody(0.0), *arguments)
 
 

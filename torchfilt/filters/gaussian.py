@@ -1,6 +1,5 @@
 """Gaussian filters: one square-root recursion, one moment rule; the named methods differ by the rule."""
 
-import torch
 from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
@@ -49,10 +48,7 @@ class GaussianFilter(Filter[Gaussian]):
         Raises:
             ValueError: the prior has a batch of its own, which is another one.
         """
-        prior = self.model.prior()
-        lead = prior.mean.shape[:-1]
-        if lead and lead != torch.Size(batch_shape):
-            raise ValueError(f"the prior is for a batch of {tuple(lead)}, not {tuple(batch_shape)}")
+        prior = self.model.prior(batch_shape)
         mean = prior.mean.expand(*batch_shape, prior.mean.shape[-1])
         return FilterState(Gaussian(mean, prior.factor(), prior.space), 0, seed)
 
@@ -80,8 +76,9 @@ class GaussianFilter(Filter[Gaussian]):
         result = self.update(belief, y, missing)
         posterior = result.belief
         # A factor made by a triangularisation cannot lose definiteness but by NaN; a failed downdate is NaN as well.
-        sound = torch.isfinite(posterior.scale_tril).flatten(-2).all(-1) & torch.isfinite(posterior.mean).all(-1)
-        ok = torch.isfinite(result.log_likelihood) & sound
+        # NaN and infinity survive a sum, and only what is neither leaves nothing when it is taken from itself.
+        probe = result.log_likelihood + posterior.mean.sum(-1) + posterior.scale_tril.sum((-2, -1))
+        ok = probe - probe == 0
         info = StepInfo(result.log_likelihood, ok, result.innovation, result.innovation_scale_tril, result.nis)
         return posterior, info
 

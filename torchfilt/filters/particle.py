@@ -12,9 +12,9 @@ from torchfilt.model import Conditional, StateSpaceModel
 from torchfilt.moments import Missing, Rule, unscented
 from torchfilt.moves import MetropolisHastings
 from torchfilt.noise import NoiseSource
-from torchfilt.particles import Particles, uniform_log_weights
+from torchfilt.particles import Particles
 from torchfilt.proposals import Local, Prior, Proposed, Redraw
-from torchfilt.resampling import Resampler, ess_below, gather_particles, systematic
+from torchfilt.resampling import Resampler, by_component, ess_below, gather_particles, systematic
 from torchfilt.run import Filter, Step
 from torchfilt.types import FilterState, StepInfo, StepNoise
 
@@ -44,7 +44,8 @@ class ParticleFilter(Filter[Particles]):
     Raises:
         ValueError: fewer than two particles (pooled redraw: than e + 2), a move on particles with covariances.
 
-    Source: Scibior and Wood, Differentiable particle filtering without modifying the forward pass (2021), for gradients.
+    Source: Scibior and Wood, Differentiable particle filtering without modifying the forward pass (2021), for the
+        gradients.
     """
 
     def __init__(
@@ -71,11 +72,19 @@ class ParticleFilter(Filter[Particles]):
             )
         self.particles, self.proposal, self.resampler, self.move = particles, proposal, resampler, move
         self.fast_normals = fast_normals
-        self.evidence = proposal.evidence
+        linear = model.is_linear() and isinstance(model.initial(), Gaussian)
+        # Where linearisation leaves nothing out, a bank of Gaussians is a proper importance sampler.
+        self.evidence = "unbiased" if linear and proposal.evidence == "linearized" else proposal.evidence
 
     def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[Particles]:
-        """Particles of the initial law for ``batch_shape`` independent runs, x (*batch, n, d)."""
+        """Particles of the initial law for ``batch_shape`` independent runs, x (*batch, n, d).
+
+        Raises:
+            ValueError: the prior has a batch of its own, which is another one.
+        """
         initial = self.model.initial()
+        if isinstance(initial, Gaussian):
+            self.model.prior(batch_shape)
         shape = (*batch_shape, self.particles)
         source = NoiseSource(seed, self.fast_normals)
         like = initial.mean
@@ -128,6 +137,8 @@ class ParticleFilter(Filter[Particles]):
         if predict:
             belief, ancestors, chosen = self._resample(belief, noise.resampling)
             belief = self.proposal.refresh(belief, noise.redraw, chosen)
+        else:
+            belief = by_component(belief)
         u = u.unsqueeze(-2) if u is not None and u.dim() > 1 else u
         dt = dt.unsqueeze(-2) if isinstance(dt, Tensor) and dt.dim() > 1 else dt
         y = y.unsqueeze(-2)
@@ -151,7 +162,7 @@ class ParticleFilter(Filter[Particles]):
         everyone = torch.arange(n, device=belief.x.device)
         few = 1 / weights.square().sum(-1) < self.resampler.threshold * n
         if self.resampler.threshold == 0 or not (torch.compiler.is_compiling() or bool(few.any())):
-            return belief, everyone.expand_as(belief.log_weights), torch.zeros_like(few)
+            return by_component(belief), everyone.expand_as(belief.log_weights), torch.zeros_like(few)
         ancestors = torch.where(few.unsqueeze(-1), self.resampler(weights, uniforms), everyone)
         return self._select(belief, ancestors, few), ancestors, few
 
@@ -170,15 +181,19 @@ class ParticleFilter(Filter[Particles]):
         return Particles(x, log_weights, factor, belief.space)
 
 
+def _normalise(log_weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Normalised log-weights, their sum's logarithm (*batch) and the weights; NaN in rows without any weight."""
+    normalised = torch.log_softmax(log_weights, -1)
+    # Both largest entries belong to the same particle; one pass less over the particles than logsumexp takes.
+    return normalised, log_weights.amax(-1) - normalised.amax(-1), torch.softmax(log_weights, -1)
+
+
 def _reweight(belief: Particles, proposed: Proposed) -> tuple[Particles, Tensor, Tensor]:
     """Normalised posterior, log-likelihood (*batch) and status (*batch)."""
     log_weights = belief.log_weights + proposed.log_weight
-    normalised = torch.log_softmax(log_weights, -1)
-    # Both largest entries belong to the same particle; one pass less over the particles than logsumexp takes.
-    log_likelihood = log_weights.amax(-1) - normalised.amax(-1)
+    normalised, log_likelihood, weights = _normalise(log_weights)
     ok = log_likelihood - log_likelihood == 0  # neither NaN nor infinite
-    held = (normalised, torch.softmax(log_weights, -1))
-    after = Particles(proposed.x, normalised, proposed.scale_tril, proposed.space, held)
+    after = Particles(proposed.x, normalised, proposed.scale_tril, proposed.space, (normalised, weights))
     if not torch.compiler.is_compiling() and bool(ok if ok.dim() == 0 else ok.all()):
         return after, log_likelihood, ok
     return _mend(belief, proposed, log_weights)
@@ -187,19 +202,27 @@ def _reweight(belief: Particles, proposed: Proposed) -> tuple[Particles, Tensor,
 def _mend(belief: Particles, proposed: Proposed, log_weights: Tensor) -> tuple[Particles, Tensor, Tensor]:
     """Rows with weights that are not numbers: such particles get weight zero, rows without any keep what they had."""
     sick = torch.isnan(log_weights) | (log_weights == math.inf)
-    cleaned = torch.where(sick, -math.inf, log_weights)
-    log_likelihood = torch.logsumexp(cleaned, -1)
+    normalised, log_likelihood, weights = _normalise(torch.where(sick, -math.inf, log_weights))
     alive = torch.isfinite(log_likelihood)
-    normalised = cleaned - torch.where(alive, log_likelihood, 0).unsqueeze(-1)
+    log_likelihood = torch.where(alive, log_likelihood, -math.inf)
     kept = torch.where(alive.unsqueeze(-1), normalised, belief.log_weights)
+    weights = torch.where(alive.unsqueeze(-1), weights, belief.weights)
     # A sick particle must not reach the moments: zero times NaN is NaN.
     bad = (sick | ~torch.isfinite(proposed.x).all(-1)).unsqueeze(-1)
-    x = torch.where(bad, belief.x, proposed.x)
+    x = _laid_out_as(proposed.x, torch.where(bad, belief.x, proposed.x))
     factor = proposed.scale_tril
     if factor is not None:
         before = belief.scale_tril if belief.scale_tril is not None else torch.zeros_like(factor)
-        factor = torch.where(bad.unsqueeze(-1), before, factor)
-    return Particles(x, kept, factor, proposed.space), log_likelihood, alive & torch.isfinite(x).all(-1).all(-1)
+        factor = _laid_out_as(factor, torch.where(bad.unsqueeze(-1), before, factor))
+    after = Particles(x, kept, factor, proposed.space, (kept, weights))
+    return after, log_likelihood, alive & torch.isfinite(x).all(-1).all(-1)
+
+
+def _laid_out_as(like: Tensor, values: Tensor) -> Tensor:
+    """The same values in the memory order of ``like``: sums round by it, and no row may notice another one's fate."""
+    if torch.compiler.is_compiling() or values.shape != like.shape or values.stride() == like.stride():
+        return values
+    return torch.empty_like(like).copy_(values)
 
 
 def _tangent_size(initial: Conditional) -> int:

@@ -12,6 +12,7 @@ from torchfilt.models.relative_motion.transforms import apply_matrix
 Step = Tensor | float | None
 # Gauss-Legendre nodes of the noise integral: exact to rounding for steps up to a revolution (frequency 2 n).
 _NODES = 24
+_HELD = ("matrix", "push", "scale_tril")
 
 
 def cw_transition(mean_motion_rad_s: Tensor, dt_s: Tensor) -> Tensor:
@@ -113,8 +114,9 @@ class ClohessyWiltshire(nn.Module):
         self.held = dt_s is not None and not (n.requires_grad or psd.requires_grad)
         if self.held:
             assert dt_s is not None
-            for name, value in zip(("matrix", "push", "scale_tril"), self._make(dt_s), strict=True):
+            for name, value in zip(_HELD, self._make(dt_s), strict=True):
                 self.register_buffer(name, value, persistent=False)
+            self.register_load_state_dict_post_hook(_make_again)
 
     def _make(self, dt: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
         n, psd = self.mean_motion_rad_s, self.acceleration_psd_m2_s3
@@ -141,6 +143,13 @@ class ClohessyWiltshire(nn.Module):
         matrix, offset, scale_tril = self.linear_form(u, dt)
         mean = apply_matrix(matrix.to(x.dtype), x)
         return Gaussian(mean if offset is None else mean + offset.to(x.dtype), scale_tril.to(x.dtype))
+
+
+def _make_again(law: ClohessyWiltshire, incompatible: object) -> None:
+    """Held matrices follow constants that were just loaded."""
+    assert law.dt_s is not None
+    for name, value in zip(_HELD, law._make(law.dt_s), strict=True):
+        getattr(law, name).copy_(value)
 
 
 def _scalar(value: Tensor | float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Relative motion under an unknown acceleration that repeats with the orbit: learned while filtering, no training set."""
+"""Relative motion under an unknown acceleration that repeats with the orbit, learned while filtering."""
 
 import torch
 from torch import Tensor, nn
@@ -17,8 +17,8 @@ class HarmonicForce(nn.Module):
     """Clohessy-Wiltshire motion plus an acceleration in harmonics of the chief's argument of latitude u.
 
     State (..., 6 + 3 (2 M + 1)): the Hill state, then for each Hill axis the coefficients of
-    (1, cos u, ..., cos M u, sin u, ..., sin M u) in m/s^2. The differential perturbations of a formation repeat with the
-    orbit, so a few constants hold them. Linear in the state: an exact Kalman filter applies.
+    (1, cos u, ..., cos M u, sin u, ..., sin M u) in m/s^2. The differential perturbations of a formation repeat with
+    the orbit, so a few constants hold them. Linear in the state: an exact Kalman filter applies.
 
     Args:
         law: linear relative motion; its noise is what the harmonics leave out.
@@ -28,15 +28,13 @@ class HarmonicForce(nn.Module):
     Raises:
         ValueError: order below 1, negative drift.
 
-    Source: Alvarez, Luengo, Lawrence, Linear latent force models using Gaussian processes, IEEE TPAMI 35 (2013), for the
-        idea; the force here is a trigonometric polynomial of the phase.
+    Source: Alvarez, Luengo, Lawrence, Linear latent force models using Gaussian processes, IEEE TPAMI 35 (2013), for
+        the idea; the force here is a trigonometric polynomial of the phase.
     """
 
     drift_psd_m2_s5: Tensor
 
-    def __init__(
-        self, law: ClohessyWiltshire, order: int = 3, drift_psd_m2_s5: Tensor | float = 0.0
-    ) -> None:
+    def __init__(self, law: ClohessyWiltshire, order: int = 3, drift_psd_m2_s5: Tensor | float = 0.0) -> None:
         super().__init__()
         if order < 1:
             raise ValueError(f"order must be at least 1, got {order}")
