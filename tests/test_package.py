@@ -55,7 +55,7 @@ LAYERS = [
     ["gaussian", "particles", "noise"],
     ["types"],
     ["moments", "resampling", "laws", "history"],
-    ["model", "gp"],
+    ["model", "gp", "recording"],
     ["proposals", "moves", "models"],
     ["run"],
     ["filters"],

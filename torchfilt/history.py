@@ -3,9 +3,9 @@
 import io
 import json
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from zipfile import BadZipFile
 
 import torch
@@ -17,7 +17,6 @@ from torchfilt.spaces import EUCLIDEAN, Angle, Euclidean, Product, Space, UnitQu
 from torchfilt.storage import IntegrityError, read_verified, write_verified
 from torchfilt.types import FilterState, StepInfo
 
-Record = Literal["mean", "moments", "beliefs"]
 FILE_KIND = "torchfilt history"
 
 
@@ -193,82 +192,3 @@ def _belief(tensors: dict[str, Tensor], prefix: str, head: dict[str, Any], space
     log_weights, weights = own["log_weights"], own.get("weights")
     held = None if weights is None else (log_weights, weights)
     return Particles(own["x"], log_weights, own.get("scale_tril"), space, held)
-
-
-@dataclass
-class Recorder:
-    """Collects beliefs and reports step by step, keeping as much as ``record`` says."""
-
-    record: Record
-    evidence: str
-    means: list[Tensor] = field(default_factory=list)
-    covariances: list[Tensor] = field(default_factory=list)
-    beliefs: list[Gaussian | Particles] = field(default_factory=list)
-    infos: list[StepInfo] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        if self.record not in ("mean", "moments", "beliefs"):
-            raise ValueError(f"record must be 'mean', 'moments' or 'beliefs', got {self.record!r}")
-
-    def add(self, belief: Gaussian | Particles, info: StepInfo) -> None:
-        """Take in one step."""
-        if self.record != "beliefs":
-            info = info._replace(ancestors=None)
-        if self.record == "mean":
-            info = info._replace(innovation=None, innovation_scale_tril=None)
-        self.infos.append(info)
-        if isinstance(belief, Gaussian):
-            self.means.append(belief.mean)
-            if self.record != "mean":
-                self.beliefs.append(belief)
-            return
-        if self.record == "mean":
-            self.means.append(belief.mean)
-            return
-        mean, covariance = belief.moments()
-        self.means.append(mean)
-        self.covariances.append(covariance)
-        if self.record == "beliefs":
-            self.beliefs.append(belief)
-
-    def finish(self, final: FilterState[Any]) -> History:
-        """The history of all steps taken in."""
-        mean = _stack_rows(self.means)
-        covariance = torch.stack(self.covariances) if self.covariances else None
-        info = StepInfo(*(_stack([step[k] for step in self.infos]) for k in range(len(StepInfo._fields))))  # type: ignore[arg-type]
-        beliefs: Gaussian | Particles | None = None
-        if self.beliefs and isinstance(self.beliefs[0], Gaussian):
-            factor = _stack([belief.scale_tril for belief in self.beliefs])
-            assert factor is not None
-            # Room for batch dims where all rows share one factor a step.
-            missing = mean.dim() + 1 - factor.dim()
-            factor = factor.reshape(len(factor), *[1] * missing, *factor.shape[1:])
-            beliefs = Gaussian(mean, factor, self.beliefs[0].space)
-        elif self.beliefs:
-            clouds = [belief for belief in self.beliefs if isinstance(belief, Particles)]
-            beliefs = Particles(
-                torch.stack([cloud.x for cloud in clouds]),
-                torch.stack([cloud.log_weights for cloud in clouds]),
-                _stack([cloud.scale_tril for cloud in clouds]),
-                clouds[0].space,
-            )
-        return History(mean, info, final, self.evidence, final.belief.space, beliefs, covariance)
-
-
-def _stack_rows(values: list[Tensor]) -> Tensor:
-    """Along time; rows that lie component by component in memory are copied as they lie."""
-    if values[0].dim() == 2 and values[0].stride(-2) == 1:
-        return torch.stack([value.mT for value in values]).mT
-    return torch.stack(values)
-
-
-def _stack(values: list[Tensor | None]) -> Tensor | None:
-    """Along time; steps whose rows share a value are widened where other steps have one a row."""
-    present = [value for value in values if value is not None]
-    if len(present) < len(values):
-        return None
-    shapes = {value.shape for value in present}
-    if len(shapes) > 1:
-        widest = torch.broadcast_shapes(*shapes)
-        present = [value.expand(widest) for value in present]
-    return torch.stack(present)

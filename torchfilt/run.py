@@ -7,10 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.history import History, Record, Recorder
+from torchfilt.history import History
 from torchfilt.model import StateSpaceModel
 from torchfilt.moments import Missing
 from torchfilt.particles import Particles
+from torchfilt.recording import Record, Recorder
 from torchfilt.types import FilterError, FilterState, StepInfo, StepNoise
 
 B = TypeVar("B", Gaussian, Particles)
@@ -162,7 +163,7 @@ class Filter(nn.Module, Generic[B]):
             _check_controls(controls, measurements, "controls", controls.shape[1:-1], measurements.shape[1:-1])
         steps = _time_steps(dt, measurements)
         missing = _missing_by_step(measurements)
-        recorder = Recorder(record, self.evidence)
+        recorder = Recorder(record, self.evidence, len(measurements))
         belief, start = state.belief, state.step
         _keep_memory(belief)
         for k in _counted(len(measurements), progress):
@@ -209,7 +210,8 @@ def _check_measurements(y: Tensor, belief: Gaussian | Particles, name: str, batc
         raise ValueError(
             f"{name} must be {axes} with the state's *batch = {tuple(_batch_of(belief))}, got {tuple(y.shape)}"
         )
-    _refuse(y, torch.isinf(y.detach()), f"{name} must be finite or NaN (not measured)")
+    if not _complete(y):
+        _refuse(y, torch.isinf(y.detach()), f"{name} must be finite or NaN (not measured)")
 
 
 def _check_controls(u: Tensor, y: Tensor, name: str, own: torch.Size, batch: torch.Size) -> None:
@@ -250,20 +252,25 @@ def _time_steps(dt: Step, measurements: Tensor) -> list[Any]:
     return list(dt.unsqueeze(-1))
 
 
+def _complete(y: Tensor) -> bool:
+    """Whether the sum of all numbers is finite, and so each: one pass, and no more to look for where all is there."""
+    return bool(torch.isfinite(y.detach().sum()))
+
+
 def _missing_of(y: Tensor) -> Missing:
     """Pattern of one step."""
-    absent = torch.isnan(y)
-    if not bool(absent.any()):
+    if _complete(y):
         return "none"
+    absent = torch.isnan(y)
     rows = absent.reshape(-1, absent.shape[-1])
     return "shared" if bool((rows == rows[0]).all()) else "rows"
 
 
 def _missing_by_step(measurements: Tensor) -> list[Missing]:
     """Pattern of each step, looked up once for the whole series."""
-    absent = torch.isnan(measurements)
-    if not bool(absent.any()):
+    if _complete(measurements):
         return ["none"] * len(measurements)
+    absent = torch.isnan(measurements)
     rows = absent.reshape(len(absent), -1, absent.shape[-1])
     some, equal = rows.flatten(1).any(1).tolist(), (rows == rows[:, :1]).flatten(1).all(1).tolist()
     return ["none" if not a else "shared" if b else "rows" for a, b in zip(some, equal, strict=True)]

@@ -133,12 +133,12 @@ class ParticleFilter(Filter[Particles]):
         """
         if noise is None:
             raise ValueError("a particle filter's step needs its random numbers: noise=filter.draw(belief, step, seed)")
-        ancestors = None
         if predict:
             belief, ancestors, chosen = self._resample(belief, noise.resampling)
             belief = self.proposal.refresh(belief, noise.redraw, chosen)
         else:
             belief = by_component(belief)
+            ancestors = torch.arange(self.particles, device=belief.x.device).expand_as(belief.log_weights)
         u = u.unsqueeze(-2) if u is not None and u.dim() > 1 else u
         dt = dt.unsqueeze(-2) if isinstance(dt, Tensor) and dt.dim() > 1 else dt
         y = y.unsqueeze(-2)
