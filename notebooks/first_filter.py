@@ -42,7 +42,7 @@ model = tf.StateSpaceModel(prior, rm.ClohessyWiltshire(settings.mean_motion_rad_
 # `nees` is the error measured in the filter's own covariance. Averaged over runs it should lie inside the band.
 
 # %%
-low, high = chi_square_band(6, 50)
+band = chi_square_band(6, 50)
 filters = {
     "EKF": tf.ExtendedKalmanFilter(model),
     "UKF": tf.UnscentedKalmanFilter(model),
@@ -53,10 +53,10 @@ results = {name: run(measurements, dt=10.0) for name, run in filters.items()}
 for name, history in results.items():
     error = history.mean - states[1:].unsqueeze(1)
     rmse = error[..., :3].square().sum(-1).mean(1).sqrt()
-    consistency = nees(error, history.covariance).mean(1)
+    consistency = nees(history.mean, states[1:].unsqueeze(1), history.covariance).mean(1)
     print(
         f"{name:18s} position error at the end {rmse[-1]:.3f} m, NEES {consistency[-1]:.1f} "
-        f"(95 % band {low:.1f} to {high:.1f}), log-likelihood {history.log_likelihood.mean():.1f}"
+        f"(95 % band {band.low:.1f} to {band.high:.1f}), log-likelihood {history.log_likelihood.mean():.1f}"
     )
 
 # %% [markdown]

@@ -1,9 +1,10 @@
 #!/usr/bin/env python
 """The main job, end to end: learn relative dynamics, then track with them.
 
-Two studies run side by side, one process each: the simulated formation (run_formation.py) and a day of GRACE A and B
-(run_grace.py). Both are usable alone. Interrupted, the same command goes on where it stood. The run folder receives
-metrics.json with the numbers of both, and their figures.
+Two studies run side by side, one process each: the simulated formation
+(run_formation.py) and a day of GRACE A and B (run_grace.py). Both are usable
+alone. Interrupted, the same command goes on where it stood. The run folder
+receives metrics.json with the numbers of both, and their figures.
 """
 
 import json
@@ -16,22 +17,38 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from _command import EXIT_FAILED, EXIT_OK, EXIT_USAGE, new_parser
 from jsonargparse import ArgumentParser
 
-EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 STUDIES = {"paper": "run_formation.py", "grace": "run_grace.py"}
 SCRIPTS = Path(__file__).parent
 
 
+EXAMPLES = """\
+examples:
+  the defaults: 10 runs of the formation, 5 noise seeds on the log
+    demo.py
+  more runs
+    demo.py --runs 100 --grace-runs 20 --out runs/demo-100
+
+exit codes: 0 done, 1 failed, 2 wrong use, 130 or 143 stopped by SIGINT or
+SIGTERM; finished stages are kept.
+"""
+
+
 def build_parser() -> ArgumentParser:
     """All options; nothing heavy is imported here, so that --help answers at once."""
-    parser = ArgumentParser(prog="demo.py", description=__doc__)
-    parser.add_argument("--runs", default=10, type=int, metavar="R", help="Monte-Carlo runs of the simulated formation")
-    parser.add_argument("--grace-runs", default=5, type=int, metavar="R", help="noise seeds on the GRACE log")
-    parser.add_argument("--seed", default=0, type=int, help="of noise, initial errors and particles")
-    parser.add_argument("--out", default="runs/demo", type=str, metavar="DIR", help="run folder")
-    parser.add_argument("--force", action="store_true", help="start anew instead of going on with what is there")
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors and the tables")
+    parser = new_parser("demo.py", __doc__, EXAMPLES)
+
+    group = parser.add_argument_group("Studies")
+    group.add_argument("--runs", default=10, type=int, metavar="R", help="Monte-Carlo runs of the simulated formation")
+    group.add_argument("--grace-runs", default=5, type=int, metavar="R", help="noise seeds on the GRACE log")
+    group.add_argument("--seed", default=0, type=int, metavar="N", help="of noise, initial errors and particles")
+
+    group = parser.add_argument_group("Output")
+    group.add_argument("--out", default="runs/demo", type=str, metavar="DIR", help="run folder")
+    group.add_argument("--force", action="store_true", help="start anew instead of going on with what is there")
+    group.add_argument("--quiet", action="store_true", help="print nothing but errors and the tables")
     return parser
 
 

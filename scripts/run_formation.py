@@ -1,27 +1,53 @@
 #!/usr/bin/env python
-"""Track a satellite relative to another from radar, with learned and with known dynamics, and compare the filters.
+"""Track a satellite relative to another from radar, with learned and with known
+dynamics, and compare the filters.
 
-The formation of Wei, Song and Zhang (2012) is simulated with J2-J4 and drag; a Gaussian process learns the one-step map
-from 500 pairs; all Monte-Carlo runs go through each filter as one batch. The run folder receives metrics.json, figures
-and the stages from which an interrupted run goes on.
+The formation of Wei, Song and Zhang (2012) is simulated with J2-J4 and drag; a
+Gaussian process learns the one-step map from 500 pairs; all Monte-Carlo runs go
+through each filter as one batch. The run folder receives metrics.json,
+table.txt, figures and the stages from which an interrupted run goes on.
 """
 
-import signal
 import sys
-from types import FrameType
 from typing import Any
 
+from _command import UsageError, add_output_options, check_folder, new_parser, run_command
 from jsonargparse import ArgumentParser
 
-EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
-FILTERS = ("cw-pf", "cw-pf-paper-noise", "cw-ukf", "gp-ukf", "mf-upf", "mf-upf-literal", "exact-ukf")
+FILTERS = (
+    "cw-pf",
+    "cw-pf-paper-noise",
+    "cw-ukf",
+    "gp-ukf",
+    "mf-upf",
+    "mf-upf-literal",
+    "latent-force-ukf",
+    "exact-ukf",
+)
 CASES = ("nominal", "moved", "wide", "control", "leak")
+
+
+EXAMPLES = """\
+examples:
+  the study: seven filters and a radar-only one, 10 runs, two revolutions
+    run_formation.py
+  more runs, only the learned filters and their bound
+    run_formation.py --runs 40 --filters gp-ukf,mf-upf,exact-ukf
+  a wide prior, where the bootstrap filter fails
+    run_formation.py --case wide --filters cw-pf,mf-upf --out runs/wide
+  what training on the tracked trajectory itself pretends
+    run_formation.py --case leak --filters gp-ukf,exact-ukf --out runs/leak
+  a third revolution, learned from radar alone
+    run_formation.py --steps 1749 --filters latent-force-ukf --out runs/latent
+
+exit codes: 0 done, 1 failed, 2 wrong use, 130 or 143 stopped by SIGINT or
+SIGTERM; finished stages are kept.
+"""
 
 
 def build_parser() -> ArgumentParser:
     """All options; nothing heavy is imported here, so that --help answers at once."""
-    parser = ArgumentParser(prog="run_formation.py", description=__doc__)
-    parser.add_argument("--config", action="config", help="YAML file with any of these options")
+    parser = new_parser("run_formation.py", __doc__, EXAMPLES)
 
     group = parser.add_argument_group("Study")
     group.add_argument(
@@ -54,66 +80,22 @@ def build_parser() -> ArgumentParser:
         "--cw-psd-m2-s3", default=3e-9, type=float, metavar="Q", help="acceleration noise of Clohessy-Wiltshire motion"
     )
 
-    group = parser.add_argument_group("Output")
-    group.add_argument("--out", default="runs/formation", type=str, metavar="DIR", help="run folder")
-    group.add_argument("--resume", action="store_true", help="go on with what the run folder holds")
-    group.add_argument("--force", action="store_true", help="overwrite what the run folder holds")
-    group.add_argument("--figures", default=True, type=bool, help="draw figures")
-    group.add_argument("--threads", default=1, type=int, help="CPU threads; small tensors gain nothing from more")
-    group.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_output_options(parser, "runs/formation")
     return parser
 
 
-class Stop:
-    """Ends the run at the next step: stages that are done are kept. SIGTERM is treated as Ctrl-C is."""
-
-    def __init__(self) -> None:
-        self.received = 0
-        signal.signal(signal.SIGINT, self._receive)
-        signal.signal(signal.SIGTERM, self._receive)
-
-    def _receive(self, number: int, frame: FrameType | None) -> None:
-        self.received = number
-        raise KeyboardInterrupt
-
-
 def main(arguments: list[str] | None = None) -> int:
-    """Run and return the exit code: 0 done, 1 failed, 2 wrong use, 128 + signal (130 for Ctrl-C) when interrupted."""
-    options = build_parser().parse_args(arguments).as_dict()
-    stop = Stop()
-    try:
-        _run(options)
-    except KeyboardInterrupt:
-        print(f"\nstopped; go on with --resume --out {options['out']}", file=sys.stderr)
-        return 128 + (stop.received or signal.SIGINT)
-    except UsageError as error:
-        return _fail(error, options["debug"], EXIT_USAGE)
-    except (OSError, ValueError, TypeError, RuntimeError, ArithmeticError) as error:
-        return _fail(error, options["debug"], EXIT_FAILED)
-    return EXIT_OK
-
-
-class UsageError(Exception):
-    """Options that make no sense, or would destroy something."""
+    """Run and return the exit code."""
+    options = build_parser().parse_args(sys.argv[1:] if arguments is None else arguments).as_dict()
+    return run_command("run_formation.py", options, _run)
 
 
 def _run(options: dict[str, Any]) -> None:
-    from pathlib import Path
-
     names = [name.strip() for name in options["filters"].split(",") if name.strip()]
     unknown = [name for name in names if name not in FILTERS]
     if unknown or not names:
         raise UsageError(f"--filters takes {','.join(FILTERS)}; got {','.join(unknown) or 'none'}")
-    if options["threads"] < 1:
-        raise UsageError(f"--threads must be at least 1, got {options['threads']}")
-    if options["resume"] and options["force"]:
-        raise UsageError("--resume goes on with a run and --force overwrites it: give one of them")
-    folder = Path(options["out"])
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"--out {folder} is a file, not a folder")
-    if folder.is_dir() and any(folder.iterdir()) and not (options["resume"] or options["force"]):
-        raise UsageError(f"--out {folder} is not empty: --resume goes on with it, --force overwrites it")
+    folder = check_folder(options)
 
     import torch
 
@@ -125,7 +107,8 @@ def _run(options: dict[str, Any]) -> None:
         settings = StudySettings(**{name: options[name] for name in (*own, "gp_psd_m2_s3", "cw_psd_m2_s3")})
     except ValueError as error:
         raise UsageError(str(error)) from None
-    torch.set_num_threads(options["threads"])
+    if options["threads"] is not None:
+        torch.set_num_threads(options["threads"])
     if options["force"]:
         Stages(folder / "stages").clear()
     quiet = options["quiet"]
@@ -137,13 +120,6 @@ def _run(options: dict[str, Any]) -> None:
         progress=not quiet,
         figures=options["figures"],
     )
-
-
-def _fail(error: Exception, debug: bool, code: int) -> int:
-    if debug:
-        raise error
-    print(f"run_formation.py: {(str(error) or type(error).__name__).splitlines()[0]}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

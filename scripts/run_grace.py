@@ -8,16 +8,11 @@ with the precise orbits of hours that were not learned from. The run folder
 receives settings, metrics, a table, figures and the finished parts.
 """
 
-import signal
 import sys
-from argparse import RawDescriptionHelpFormatter
-from pathlib import Path
-from types import FrameType, TracebackType
 from typing import Any
 
-from jsonargparse import ArgumentParser, DefaultHelpFormatter
-
-EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
+from _command import UsageError, add_output_options, check_folder, new_parser, run_command
+from jsonargparse import ArgumentParser
 
 EXAMPLES = """\
 examples:
@@ -35,26 +30,9 @@ SIGTERM, finished parts kept.
 """
 
 
-class HelpFormatter(DefaultHelpFormatter, RawDescriptionHelpFormatter):
-    """Keeps the lines of the description and the examples; gives a default where there is one to give."""
-
-    def _get_help_string(self, action: Any) -> str:
-        text = action.help or ""
-        if not action.option_strings or action.default in (None, "==SUPPRESS==") or action.nargs == 0:
-            return text
-        return f"{text} (default: %(default)s)"
-
-
 def build_parser() -> ArgumentParser:
     """All options; nothing heavy is imported here, so that --help answers at once."""
-    parser = ArgumentParser(
-        prog="run_grace.py",
-        usage="%(prog)s [options]",
-        description=__doc__,
-        epilog=EXAMPLES,
-        formatter_class=HelpFormatter,
-    )
-    parser.add_argument("--config", action="config", metavar="FILE", help="YAML or JSON file with any of these options")
+    parser = new_parser("run_grace.py", __doc__, EXAMPLES)
 
     group = parser.add_argument_group("Data")
     group.add_argument("--folder", default="data/grace_2010", type=str, metavar="DIR", help="the log")
@@ -94,74 +72,22 @@ def build_parser() -> ArgumentParser:
         "--settle-minutes", default=94.0, type=float, metavar="MIN", help="first part that no error is counted in"
     )
 
-    group = parser.add_argument_group("Output")
-    group.add_argument("--out", default="runs/grace", type=str, metavar="DIR", help="run folder")
-    group.add_argument("--resume", action="store_true", help="keep the finished parts that the run folder holds")
-    group.add_argument("--force", action="store_true", help="overwrite the run in the run folder")
-    group.add_argument("--figures", default=True, type=bool, metavar="BOOL", help="draw figures")
-    group.add_argument("--threads", type=int | None, metavar="N", help="CPU threads; as many as torch likes")
-    group.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_output_options(parser, "runs/grace")
     return parser
-
-
-class UsageError(Exception):
-    """Options that make no sense, or would destroy something."""
-
-
-class Stop:
-    """SIGINT and SIGTERM end the run at once; finished parts are kept."""
-
-    def __init__(self) -> None:
-        self.received = 0
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> "Stop":
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._receive)
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _receive(self, number: int, frame: FrameType | None) -> None:
-        self.received = number
-        raise KeyboardInterrupt
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run and return the exit code."""
     options = build_parser().parse_args(sys.argv[1:] if arguments is None else arguments).as_dict()
-    out, debug = options["out"], options["debug"]
-    stop = Stop()
-    try:
-        with stop:
-            _run(options)
-    except (KeyboardInterrupt, SystemExit):  # a training turns the first into the second
-        if not stop.received:
-            raise
-        print(f"run_grace.py: stopped; go on with --resume --out {out}", file=sys.stderr)
-        return 128 + stop.received
-    except UsageError as error:
-        return _fail(error, debug, EXIT_USAGE)
-    except Exception as error:
-        return _fail(error, debug, EXIT_FAILED)
-    return EXIT_OK
+    return run_command("run_grace.py", options, _run)
 
 
 def _run(options: dict[str, Any]) -> None:
+    folder = check_folder(options)
     options.pop("config", None)
-    out, force, resume, figures, threads, quiet, _ = (
+    _, force, _, figures, threads, quiet, _ = (
         options.pop(name) for name in ("out", "force", "resume", "figures", "threads", "quiet", "debug")
     )
-    folder = Path(out)
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"--out {out}: not a folder")
-    if resume and force:
-        raise UsageError("--resume goes on with a run and --force overwrites it: give one of them")
-    if (folder / "settings.json").exists() and not (resume or force):
-        raise UsageError(f"--out {out} holds a run already: --resume goes on with it, --force overwrites it")
 
     import torch
 
@@ -184,13 +110,6 @@ def _run(options: dict[str, Any]) -> None:
             print(line, flush=True)
 
     run(settings, out=folder, figures=figures, say=say, progress=not quiet)
-
-
-def _fail(error: Exception, debug: bool, code: int) -> int:
-    if debug:
-        raise error
-    print(f"run_grace.py: {(str(error) or type(error).__name__).splitlines()[0]}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

@@ -9,16 +9,13 @@ GP predicted (z: 1 is honest, above 1 overconfident). The run folder receives
 settings, versions, metrics, checkpoint, frozen GP and figures.
 """
 
-import signal
 import sys
-from argparse import RawDescriptionHelpFormatter
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
-from jsonargparse import ArgumentParser, DefaultHelpFormatter
-
-EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
+from _command import EXIT_FAILED, EXIT_OK, EXIT_USAGE, Signals, add_output_options, fail, new_parser
+from jsonargparse import ArgumentParser
 
 EXAMPLES = """\
 examples:
@@ -46,26 +43,9 @@ SIGTERM after saving.
 """
 
 
-class HelpFormatter(DefaultHelpFormatter, RawDescriptionHelpFormatter):
-    """Keeps the lines of the description and the examples; gives a default where there is one to give."""
-
-    def _get_help_string(self, action: Any) -> str:
-        text = action.help or ""
-        if not action.option_strings or action.default in (None, "==SUPPRESS==", [], ()) or action.nargs == 0:
-            return text
-        return f"{text} (default: %(default)s)"
-
-
 def build_parser() -> ArgumentParser:
     """All options; nothing heavy is imported here, so that --help answers at once."""
-    parser = ArgumentParser(
-        prog="train_gp.py",
-        usage="%(prog)s [options]",
-        description=__doc__,
-        epilog=EXAMPLES,
-        formatter_class=HelpFormatter,
-    )
-    parser.add_argument("--config", action="config", metavar="FILE", help="YAML or JSON file with any of these options")
+    parser = new_parser("train_gp.py", __doc__, EXAMPLES)
 
     group = parser.add_argument_group("Data")
     group.add_argument(
@@ -168,36 +148,16 @@ def build_parser() -> ArgumentParser:
         metavar="TYPE",
         help="of the learned law, float64 or float32; training is in double precision",
     )
-    group.add_argument("--threads", type=int | None, metavar="N", help="CPU threads; as many as torch likes")
 
-    group = parser.add_argument_group("Output")
-    group.add_argument("--out", default="runs/gp", type=str, metavar="DIR", help="run folder")
-    group.add_argument("--resume", action="store_true", help="go on with the run in the run folder")
-    group.add_argument("--force", action="store_true", help="overwrite the run in the run folder")
-    group.add_argument("--figures", default=True, type=bool, metavar="BOOL", help="draw figures")
+    group = add_output_options(parser, "runs/gp")
     group.add_argument("--tensorboard", action="store_true", help="log for TensorBoard beside the CSV file")
-    group.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
 
 
-class Stop:
-    """Remembers the first SIGINT or SIGTERM so that the epoch can end and be saved; a second one ends at once."""
+class AfterEpoch(Signals):
+    """Remembers the first signal so that the epoch can end and be saved; a second one ends at once."""
 
-    def __init__(self) -> None:
-        self.received = 0
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> "Stop":
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._receive)
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _receive(self, number: int, frame: FrameType | None) -> None:
+    def receive(self, number: int, frame: FrameType | None) -> None:
         if self.received:
             raise SystemExit(128 + number)
         self.received = number
@@ -224,7 +184,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run and return the exit code: 0 done, 1 failed, 2 wrong use, 128 + signal after an orderly stop."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
     quiet, debug, threads = (options.pop(name) for name in ("quiet", "debug", "threads"))
-    with Stop() as stop:
+    with AfterEpoch() as stop:
         import torch
 
         from torchfilt.learning.run import RunSettings, UsageError, run_training
@@ -239,20 +199,13 @@ def main(arguments: list[str] | None = None) -> int:
                 progress=False if quiet else None,
             )
         except UsageError as error:
-            return _fail(error, debug, EXIT_USAGE)
+            return fail("train_gp.py", error, debug, EXIT_USAGE)
         except Exception as error:
-            return _fail(error, debug, EXIT_FAILED)
+            return fail("train_gp.py", error, debug, EXIT_FAILED)
     if summary["interrupted"]:
         print(f"stopped; go on with --resume --out {options['out']}", file=sys.stderr)
         return 128 + stop.received
     return EXIT_OK
-
-
-def _fail(error: Exception, debug: bool, code: int) -> int:
-    if debug:
-        raise error
-    print(f"train_gp.py: {(str(error) or type(error).__name__).splitlines()[0]}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ _LARGE = 16_384
 class Series:
     """One quantity along time.
 
-    Large values without gradients are copied at once into one block, in the memory order they have, while they are still
-    in the processor's cache and so that their own memory can be used again; the others are stacked at the end.
+    Large values without gradients are copied at once into one block, in the memory order they have: they are still in
+    the processor's cache, and their own memory can be used again. The others are stacked at the end.
 
     Args:
         steps: how many there will be at most.

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from oracles import cramer_rao_oracle as oracle
-from scipy.stats import chi2
 
 from torchfilt import Gaussian, StateSpaceModel, UnscentedKalmanFilter
 from torchfilt.missions.bound import cramer_rao_bound
@@ -27,7 +26,6 @@ from torchfilt.missions.formation import (
     table,
     train_gp,
 )
-from torchfilt.missions.formation.study import nees_band
 from torchfilt.missions.stages import Stages
 from torchfilt.models.relative_motion import (
     FormationSettings,
@@ -290,10 +288,6 @@ class TestNumbers:
         error[:, 1] = np.nan
         assert summarize(result, scene)["orbit1"]["position_rmse_worst_m"] is None
         json.dumps(summarize(result, scene), allow_nan=False)
-
-    def test_band_of_the_mean_nees(self):
-        low, high = nees_band(10)
-        assert chi2.cdf(10 * low, 60) == pytest.approx(0.025) and chi2.sf(10 * high, 60) == pytest.approx(0.025)
 
     def test_leakage_is_a_paired_test(self):
         generator = np.random.default_rng(0)

@@ -28,25 +28,6 @@ def script():
     return module
 
 
-def test_help_loads_nothing_heavy():
-    code = (
-        "import runpy, sys\n"
-        "sys.argv = ['run_grace.py', '--help']\n"
-        "try:\n"
-        f"    runpy.run_path({str(SCRIPT)!r}, run_name='__main__')\n"
-        "except SystemExit as stop:\n"
-        "    assert stop.code == 0\n"
-        "heavy = {'torch', 'gpytorch', 'pytorch_lightning', 'numpy', 'scipy', 'matplotlib', 'torchfilt'}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert result.returncode == 0, result.stderr
-    for word in ("examples:", "exit codes:", "Data:", "Model:", "Measurements:", "Output:"):
-        assert word in result.stdout
-    assert "null" not in result.stdout and "type:" not in result.stdout
-    assert max(len(line) for line in result.stdout.splitlines()) <= 80
-
-
 def test_every_setting_has_an_option_with_its_default(script):
     options = script.build_parser().parse_args([]).as_dict()
     defaults = GraceSettings()

@@ -40,33 +40,6 @@ def command(*arguments, **options):
     return subprocess.run(line, capture_output=True, text=True, env=ENVIRONMENT, timeout=120, **options)
 
 
-def test_help_is_quick_complete_and_loads_nothing_heavy():
-    code = (
-        "import runpy, sys\n"
-        "sys.argv = ['train_gp.py', '--help']\n"
-        "try:\n"
-        f"    runpy.run_path({str(SCRIPT)!r}, run_name='__main__')\n"
-        "except SystemExit as stop:\n"
-        "    assert stop.code == 0\n"
-        "heavy = {'torch', 'gpytorch', 'pytorch_lightning', 'numpy', 'scipy', 'matplotlib', 'torchfilt'}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
-    )
-    times, text = [], ""
-    for _ in range(3):
-        begin = time.perf_counter()
-        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-        times.append(time.perf_counter() - begin)
-        assert result.returncode == 0, result.stderr
-        text = result.stdout
-    assert min(times) < 1.5
-    for word in ("examples:", "exit codes:", "an NPZ file holds", "Data:", "Model:", "Training:", "Output:"):
-        assert word in text
-    assert "null" not in text and "type:" not in text
-    assert "rad/s" in text and "m^2/s^3" in text and "time step in s" in text
-    # Readable in a terminal of usual width.
-    assert max(len(line) for line in text.splitlines()) <= 80
-
-
 def test_every_setting_has_an_option(script):
     from dataclasses import fields
 
@@ -156,7 +129,7 @@ def test_flipped_byte_in_the_checkpoint_is_refused(script, tmp_path, log, capsys
 
 def test_stop_remembers_one_signal_and_ends_at_the_second(script, capsys):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    with script.Stop() as stop:
+    with script.AfterEpoch() as stop:
         assert not stop()
         signal.raise_signal(signal.SIGTERM)
         assert stop() and stop.received == signal.SIGTERM

@@ -26,6 +26,7 @@ from torchfilt.models.relative_motion import (
     CONTROL_SIZE,
     ClohessyWiltshire,
     FormationSettings,
+    HarmonicForce,
     RendezvousRadar,
     TwoBody,
     chief_controls,
@@ -36,11 +37,13 @@ from torchfilt.models.relative_motion import (
     training_pairs,
 )
 from torchfilt.models.relative_motion.high_fidelity import ExactFormation
+from torchfilt.models.relative_motion.transforms import block_diagonal
 from torchfilt.noise import NoiseSource
 from torchfilt.resampling import ess_below
 from torchfilt.run import Filter
 
-FILTERS = ("cw-pf", "cw-pf-paper-noise", "cw-ukf", "gp-ukf", "mf-upf", "mf-upf-literal", "exact-ukf")
+LATENT = "latent-force-ukf"
+FILTERS = ("cw-pf", "cw-pf-paper-noise", "cw-ukf", "gp-ukf", "mf-upf", "mf-upf-literal", LATENT, "exact-ukf")
 LEARNED = ("gp-ukf", "mf-upf", "mf-upf-literal")
 Case = Literal["nominal", "moved", "wide", "control", "leak"]
 CASES: dict[Case, str] = {
@@ -56,6 +59,10 @@ _START, _RADAR = 0, 1
 _LEAST_EPOCHS = 20
 MOVED_M = 20.0
 THRUST_M_S2 = 1e-4
+# Prior deviation of each coefficient of the unknown force, the size of what Clohessy-Wiltshire motion lacks, and the
+# noise beside the harmonics.
+LATENT_SD_M_S2 = 3e-6
+LATENT_PSD_M2_S3 = 1e-12
 
 
 @dataclass(frozen=True)
@@ -140,11 +147,12 @@ class Scene(NamedTuple):
     def revolutions(self) -> dict[str, Tensor]:
         """Masks (t,) of the revolutions that were reached; the first 1000 s, the transient, are left out."""
         period = self.formation.period_s
-        first = (self.time_s > 1000) & (self.time_s <= period)
-        second = (self.time_s > period) & (self.time_s <= 2 * period)
-        return {
-            name: mask for name, mask in (("orbit1", first), ("orbit2", second)) if int(mask.sum()) >= _LEAST_EPOCHS
-        }
+        count = max(1, round(float(self.time_s[-1]) / period))
+        masks = {}
+        for k in range(count):
+            begin = max(1000.0, k * period)
+            masks[f"orbit{k + 1}"] = (self.time_s > begin) & (self.time_s <= (k + 1) * period)
+        return {name: mask for name, mask in masks.items() if int(mask.sum()) >= _LEAST_EPOCHS}
 
 
 def make_scene(settings: StudySettings) -> Scene:
@@ -266,6 +274,8 @@ def make_filter(name: str, scene: Scene, settings: StudySettings, gp: FrozenGP |
         raise ValueError(f"filter must be one of {', '.join(FILTERS)}, got {name!r}")
     if name in LEARNED and gp is None:
         raise ValueError(f"{name} needs the GP that train_gp makes")
+    if name == LATENT:
+        return _latent_force_filter(scene)
     transition: nn.Module
     if name in LEARNED:
         assert gp is not None
@@ -284,6 +294,18 @@ def make_filter(name: str, scene: Scene, settings: StudySettings, gp: FrozenGP |
     if name == "mf-upf-literal":
         return ParticleFilter(model, settings.particles, literal_proposal(), ess_below(0.5))  # type: ignore[arg-type]
     return UnscentedParticleFilter(model, settings.particles)
+
+
+def _latent_force_filter(scene: Scene) -> Filter[Any]:
+    """No training states: what Clohessy-Wiltshire motion lacks is estimated on the way, in harmonics of the phase."""
+    formation = scene.formation
+    law = HarmonicForce(ClohessyWiltshire(formation.mean_motion_rad_s, LATENT_PSD_M2_S3, formation.step_s), order=3)
+    mean = pad(scene.prior.mean, (0, law.force_size))
+    force = torch.full((law.force_size,), LATENT_SD_M_S2, dtype=torch.float64)
+    factor = block_diagonal(scene.prior.factor(), torch.diag(force))
+    radar = RendezvousRadar(formation.semi_major_axis_m)
+    model = StateSpaceModel(Gaussian(mean, factor), law, lambda x: radar(x[..., :6]))
+    return UnscentedKalmanFilter(model)
 
 
 def scene_bound(scene: Scene) -> Tensor:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchfilt.gp.frozen import FrozenGP
+from torchfilt.metrics import chi_square_band, nees
 from torchfilt.missions.formation.scene import (
     CASES,
     FILTERS,
@@ -26,7 +26,7 @@ from torchfilt.missions.formation.scene import (
 from torchfilt.missions.stages import Arrays, Stages
 from torchfilt.storage import IntegrityError, atomic_write
 
-METRICS = "metrics.json"
+METRICS, TABLE = "metrics.json", "table.txt"
 # Results of another version of the arithmetic are not reused: raise this with it.
 _VERSION = 1
 # A run is lost where its position error over a revolution is above this, m: one radar sample gives 0.25 m.
@@ -57,25 +57,19 @@ def run_filter(
             progress=progress,
         )
     seconds = time.process_time() - begin
-    error, covariance = history.mean - scene.truth.unsqueeze(1), history.covariance
+    # A latent force comes after the motion in the state.
+    mean, covariance = history.mean[..., :6], history.covariance[..., :6, :6]
+    truth = scene.truth.unsqueeze(1)
+    error = mean - truth
     ess = history.diagnostics.ess
     return {
         "error": error.numpy(),
         "deviation": covariance.diagonal(dim1=-2, dim2=-1).sqrt().numpy(),
-        "nees": _nees(error, covariance).numpy(),
+        "nees": nees(mean, truth, covariance).numpy(),
         "ess": np.full(error.shape[:2], np.nan) if ess is None else ess.numpy(),
         "ok": history.diagnostics.ok.numpy(),
         "cpu_s": np.array(seconds),
     }
-
-
-def _nees(error: Tensor, covariance: Tensor) -> Tensor:
-    """Squared error in units of the claimed covariance (...); NaN where that is not positive definite."""
-    scale = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    correlation = covariance / (scale.unsqueeze(-1) * scale.unsqueeze(-2))
-    factor, failed = torch.linalg.cholesky_ex(correlation)
-    white = torch.linalg.solve_triangular(factor, (error / scale).unsqueeze(-1), upper=False).squeeze(-1)
-    return torch.where(failed > 0, torch.nan, white.square().sum(-1))
 
 
 def summarize(result: Arrays, scene: Scene) -> dict[str, dict[str, Any]]:
@@ -89,7 +83,7 @@ def summarize(result: Arrays, scene: Scene) -> dict[str, dict[str, Any]]:
     """
     summary = {}
     runs = result["error"].shape[1]
-    low, high = nees_band(runs)
+    band = chi_square_band(6, runs)
     for name, mask in scene.revolutions().items():
         rows = mask.numpy()
         error = result["error"][rows]
@@ -104,8 +98,8 @@ def summarize(result: Arrays, scene: Scene) -> dict[str, dict[str, Any]]:
             entry[f"{key}_rms_all_runs_{unit}"] = _plain(np.sqrt(np.mean(rmse**2)))
         mean = result["nees"][rows].mean(1)
         entry["nees"] = _plain(mean.mean())
-        entry["nees_band_95"] = [low, high]
-        entry["nees_inside_band"] = _plain(np.mean((mean >= low) & (mean <= high)))
+        entry["nees_band_95"] = [band.low, band.high]
+        entry["nees_inside_band"] = _plain(np.mean((mean >= band.low) & (mean <= band.high)))
         entry["ess"] = _plain(result["ess"][rows].mean())
         entry["ms_per_step"] = _plain(1e3 * result["cpu_s"] / result["ok"].size)
         entry["lost"] = int(lost_runs(result, rows).sum())
@@ -124,14 +118,6 @@ def lost_runs(result: Arrays, rows: np.ndarray) -> np.ndarray:
     rmse = run_rmse(result["error"][rows][..., :3])
     value: np.ndarray = ~(rmse < LOST_M) | ~result["ok"].all(0)
     return value
-
-
-def nees_band(runs: int, size: int = 6, level: float = 0.95) -> tuple[float, float]:
-    """Where the mean of a consistent filter's NEES over independent runs lies with this probability."""
-    from scipy.stats import chi2
-
-    tail = (1 - level) / 2
-    return float(chi2.ppf(tail, size * runs) / runs), float(chi2.ppf(1 - tail, size * runs) / runs)
 
 
 def leakage(result: Arrays, exact: Arrays, rows: np.ndarray, least: float = 0.95) -> bool:
@@ -165,7 +151,7 @@ def run_formation(
 
     Args:
         settings: see `StudySettings`.
-        out: run folder; receives stages/, figures and metrics.json.
+        out: run folder; receives stages/, figures/, table.txt and metrics.json.
         filters: names out of `FILTERS`.
         say: told what happens, a line each.
         progress: show bars on a terminal.
@@ -208,9 +194,11 @@ def run_formation(
         "seeds": [settings.seed, settings.training_seed],
         "versions": versions(),
     }
-    for line in table(summary):
+    lines = table(summary)
+    for line in lines:
         say(line)
     if not summary["interrupted"]:
+        atomic_write(folder / TABLE, ("\n".join(lines).strip("\n") + "\n").encode())
         atomic_write(folder / METRICS, (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode())
         if figures:
             from torchfilt.missions.figures import formation_figures
