@@ -57,6 +57,82 @@ def test_a_matrix_for_each_row():
         torch.testing.assert_close(found.covariance, exact.covariance, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("points", [3, 5])  # 3 points and 3 rows: nothing may be paired by accident
+def test_everything_for_each_row(points):
+    """Matrix, offset and covariance of each row serve all points of the row, beside controls of each row."""
+    generator = torch.Generator().manual_seed(2)
+    scale = tensor([1.0, 2.0, 3.0])
+    offsets = torch.stack([OFFSET, 10 * OFFSET, 100 * OFFSET])
+    covariances = COVARIANCE * scale[:, None, None]
+    x = torch.randn(3, points, 3, generator=generator, dtype=torch.float64)
+    u = torch.randn(3, 1, 1, generator=generator, dtype=torch.float64)
+    for matrices in (A, A * scale[:, None, None]):
+        found = linear(matrix=matrices, covariance=covariances, offset=offsets)(x, u)
+        added = tf.AdditiveGaussian(lambda x: x[..., :2], covariances)(x)
+        for row in range(3):
+            single = A if matrices.dim() == 2 else matrices[row]
+            alone = linear(matrix=single, covariance=covariances[row], offset=offsets[row])(x[row], u[row])
+            torch.testing.assert_close(found.mean[row], alone.mean, rtol=0, atol=1e-13)
+            for law in (found, added):
+                torch.testing.assert_close(law.covariance[row, -1], covariances[row], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("particles", [3, 5])
+def test_filters_with_everything_for_each_row(particles):
+    """Gaussian filters and banks whose particles are all equal give what each row gives alone."""
+    eye = torch.eye(2, dtype=torch.float64)
+    scale = tensor([1.0, 2.0, 3.0])[:, None, None]
+    prior = tf.Gaussian(tensor([1.0, 2.0]), tensor([[0.5, 0.0], [0.1, 0.3]]))
+    generator = torch.Generator().manual_seed(3)
+    y = torch.randn(4, 3, 2, generator=generator, dtype=torch.float64)
+    u = torch.randn(4, 3, 1, generator=generator, dtype=torch.float64)
+
+    def model(row):
+        motion = tf.LinearGaussian(
+            (0.3 * scale * eye)[row], (0.1 * scale * eye)[row], (scale[:, 0] * OFFSET)[row], control_matrix=B
+        )
+        return tf.StateSpaceModel(prior, motion, tf.LinearGaussian(eye, (0.2 * scale * eye)[row]))
+
+    def bank(model, rule):
+        return tf.LocallyLinearizedParticleFilter(model, particles, rule, split=1.0)
+
+    whole, alone = model(slice(None)), [tf.KalmanFilter(model(row)) for row in range(3)]
+    expected = [one(y[:, row], u[:, row]) for row, one in enumerate(alone)]
+    rules = tf.moments.taylor(), tf.moments.unscented()
+    for found in (tf.UnscentedKalmanFilter(whole), tf.KalmanFilter(whole), *(bank(whole, rule) for rule in rules)):
+        history = found(y, u)
+        for row, one in enumerate(expected):
+            torch.testing.assert_close(history.mean[:, row], one.mean, rtol=0, atol=1e-13)
+            torch.testing.assert_close(history.covariance[:, row], one.covariance, rtol=0, atol=1e-13)
+            torch.testing.assert_close(history.log_likelihood[row], one.log_likelihood, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("function", [lambda x: x, lambda x: x[..., 0], lambda x: x[..., :1].sum()])
+def test_functions_that_do_not_fit_the_covariance_are_refused(function):
+    """Another size than the noise, or a lost axis, is named where it happens, not three products later."""
+    law = tf.AdditiveGaussian(function, tensor([[1.0]]))
+    with pytest.raises(ValueError, match=r"function must turn x \(4, 2\) into \(\*lead, 1\)"):
+        law(torch.zeros(4, 2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"covariance": 0.1}, "covariance must be a matrix .* got float"),
+        (
+            {"covariance": COVARIANCE.float()},
+            "covariance must have the dtype torch.float64, got torch.float32",
+        ),
+        ({"offset": OFFSET.float()}, "offset must have the matrix's dtype"),
+        ({"control_matrix": B.float()}, "control_matrix must have the matrix's dtype"),
+    ],
+)
+def test_types_that_are_refused(changes, message):
+    """Precisions are not mixed, and a number is not a covariance."""
+    with pytest.raises(TypeError, match=message):
+        linear(**changes)
+
+
 def test_singular_and_factor_covariances():
     singular = tensor([[1.0, 1.0], [1.0, 1.0]])
     torch.testing.assert_close(
@@ -87,7 +163,7 @@ REFUSED = {
     "none": ({"covariance": None}, "exactly one of covariance= and scale_tril="),
     "offset": ({"offset": tensor([1.0])}, r"offset must end in 2 .*got \(1,\)"),
     "NaN in the offset": ({"offset": OFFSET * torch.nan}, r"offset must be finite, entry \(0,\) is nan"),
-    "control matrix": ({"control_matrix": B.T}, r"control_matrix must have 2 rows, got shape \(1, 2\)"),
+    "control matrix": ({"control_matrix": B.T}, r"control_matrix must be \(2, k\), got shape \(1, 2\)"),
     "factor not square": (FACTOR | {"scale_tril": COVARIANCE[:1]}, r"scale_tril must be a square matrix .*\(1, 2\)"),
     "factor not lower": (FACTOR | {"scale_tril": COVARIANCE}, r"scale_tril must be lower .*\(0, 1\) is 0.2"),
     "factor not finite": (FACTOR | {"scale_tril": COVARIANCE.tril() * torch.nan}, "scale_tril must be finite"),
@@ -129,6 +205,7 @@ STYLES = [
     (lambda x, force: x + force, CallStyle(True, False, False)),
     (lambda x, gain=2.0: x * gain, CallStyle(False, False, False)),
     (lambda *given: sum(given), CallStyle(True, True, False)),
+    (lambda x, **options: 2 * x, CallStyle(False, False, False)),
     (Module(), CallStyle(False, True, True)),
     (torch.sin, CallStyle(False, False, False)),
 ]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.linalg import psd_factor
+from torchfilt.linalg import for_points, psd_factor
 from torchfilt.spaces import EUCLIDEAN, Space
 
 
@@ -47,6 +47,9 @@ class _Factor(nn.Module):
         super().__init__()
         if (covariance is None) == (scale_tril is None):
             raise ValueError("give exactly one of covariance= and scale_tril=")
+        for name, given in (("covariance", covariance), ("scale_tril", scale_tril)):
+            if given is not None and not isinstance(given, Tensor):
+                raise TypeError(f"{name} must be a matrix (e, e) as a tensor, got {type(given).__name__}")
         self._covariance: Tensor | None = None
         if covariance is not None and covariance.requires_grad:
             psd_factor(covariance)
@@ -84,12 +87,13 @@ class LinearGaussian(nn.Module):
 
     Args:
         matrix: (m, d) or (*batch, m, d).
-        covariance: (m, m) positive semidefinite; or give ``scale_tril``, its lower factor.
-        offset: (m,) or None.
+        covariance: (m, m) or (*batch, m, m), positive semidefinite; or give ``scale_tril``, its lower factor.
+        offset: (m,), (*batch, m) or None.
         control_matrix: (m, k) or None.
         trainable: make matrix, factor and offset `nn.Parameter`s.
 
     Raises:
+        TypeError: dtypes that differ.
         ValueError: shapes that do not fit, a covariance that is not positive semidefinite.
     """
 
@@ -118,11 +122,13 @@ class LinearGaussian(nn.Module):
             raise ValueError(f"covariance must be {m} x {m} to fit matrix {tuple(matrix.shape)}, got {noise_size}")
         if offset is not None and offset.shape[-1:] != (m,):
             raise ValueError(f"offset must end in {m} to fit matrix {tuple(matrix.shape)}, got {tuple(offset.shape)}")
-        if control_matrix is not None and control_matrix.shape[-2] != m:
-            raise ValueError(f"control_matrix must have {m} rows, got shape {tuple(control_matrix.shape)}")
-        for name, tensor in (("offset", offset), ("control_matrix", control_matrix)):
+        if control_matrix is not None and (control_matrix.dim() != 2 or len(control_matrix) != m):
+            raise ValueError(f"control_matrix must be ({m}, k), got shape {tuple(control_matrix.shape)}")
+        for name, tensor in (("offset", offset), ("control_matrix", control_matrix), ("covariance", self.noise())):
             if tensor is not None:
                 check_finite(tensor, name)
+                if tensor.dtype != matrix.dtype:
+                    raise TypeError(f"{name} must have the matrix's dtype {matrix.dtype}, got {tensor.dtype}")
         hold(self, "matrix", matrix, trainable)
         for name, tensor in (("offset", offset), ("control_matrix", control_matrix)):
             if tensor is None:
@@ -137,16 +143,16 @@ class LinearGaussian(nn.Module):
             if u is None:
                 raise ValueError("this law has a control_matrix but no control u was given")
             push = u @ self.control_matrix.mT
-            offset = push if offset is None else offset + push
+            offset = push if offset is None else for_points(offset, 1, push.dim() - 1) + push
         return LinearForm(self.matrix, offset, self.noise())
 
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None) -> Gaussian:
         """Law of y given x (..., d)."""
         matrix, offset, scale_tril = self.linear_form(u, dt)
-        if matrix.dim() > 2:  # a matrix a row of the batch serves all points of the row
-            matrix = matrix.unflatten(-3, (-1, *[1] * max(x.dim() + 1 - matrix.dim(), 0)))
+        lead = x.dim() - 1
+        matrix, scale_tril = for_points(matrix, 2, lead), for_points(scale_tril, 2, lead)
         mean = (matrix @ x.mT).mT if x.dim() > 1 and matrix.dim() == 2 else (matrix @ x.unsqueeze(-1)).squeeze(-1)
-        return Gaussian(mean if offset is None else mean + offset, scale_tril)
+        return Gaussian(mean if offset is None else mean + for_points(offset, 1, lead), scale_tril)
 
 
 class AdditiveGaussian(nn.Module):
@@ -155,9 +161,12 @@ class AdditiveGaussian(nn.Module):
     Args:
         function: batched over leading dims; takes x and, by name or in this order, u and dt; unused ones may be absent.
             An `nn.Module` is registered, so its parameters train.
-        covariance: (e, e) positive semidefinite; or give ``scale_tril``.
+        covariance: (e, e) or (*batch, e, e), positive semidefinite; or give ``scale_tril``.
         space: where y lives.
         trainable: make the noise factor an `nn.Parameter`.
+
+    Raises:
+        ValueError: a covariance that does not fit the space; when called, a function that gives another shape.
     """
 
     def __init__(
@@ -179,10 +188,17 @@ class AdditiveGaussian(nn.Module):
             raise ValueError(
                 f"covariance must be {space.tangent_size} x {space.tangent_size} on {space!r}, got {noise_size}"
             )
+        self.size = noise_size if space.size is None else space.size
 
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None) -> Gaussian:
         """Law of y given x (..., d)."""
-        return Gaussian(self.style.call(self.function, x, u, dt), self.noise(), self.space)
+        mean = self.style.call(self.function, x, u, dt)
+        if mean.dim() < x.dim() or mean.shape[-1] != self.size:
+            raise ValueError(
+                f"function must turn x {tuple(x.shape)} into (*lead, {self.size}), as the covariance says, "
+                f"got {tuple(mean.shape)}"
+            )
+        return Gaussian(mean, for_points(self.noise(), 2, x.dim() - 1), self.space)
 
 
 class CallStyle(NamedTuple):
@@ -214,7 +230,7 @@ def call_style(function: Callable[..., Any]) -> CallStyle:
     named = {p.name for p in parameters[1:] if p.kind is not p.POSITIONAL_ONLY}
     if named & {"u", "dt"}:
         return CallStyle("u" in named, "dt" in named, True)
-    required = [p for p in parameters[1:] if p.default is p.empty and p.kind is not p.KEYWORD_ONLY]
+    required = [p for p in parameters[1:] if p.default is p.empty and p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD)]
     return CallStyle(len(required) > 0, len(required) > 1, False)
 
 

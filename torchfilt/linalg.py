@@ -143,6 +143,20 @@ def apply_factor(factor: Tensor, vectors: Tensor, *, diagonal: bool = False) -> 
     return (factor @ vectors.unsqueeze(-1)).squeeze(-1)
 
 
+def for_points(values: Tensor, own: int, lead: int) -> Tensor:
+    """Room for points in what has one entry a row of the batch: (*batch, own dims) to (*batch, 1, ..., own dims).
+
+    Args:
+        values: shared by all rows (own dims only), or with leading dims.
+        own: how many dims belong to the entry itself.
+        lead: leading dims of the points.
+    """
+    missing = lead - (values.dim() - own)
+    if values.dim() == own or missing <= 0:
+        return values
+    return values.reshape(*values.shape[: values.dim() - own], *[1] * missing, *values.shape[values.dim() - own :])
+
+
 def whiten(factor: Tensor, residual: Tensor, *, diagonal: bool = False) -> Tensor:
     """``factor^-1 @ r`` for each residual; shapes as in `apply_factor`."""
     if diagonal:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
-from torchfilt.linalg import apply_factor, cholesky_downdate, log_abs_diagonal, triangularize, whiten
+from torchfilt.linalg import apply_factor, cholesky_downdate, for_points, log_abs_diagonal, triangularize, whiten
 from torchfilt.spaces import EUCLIDEAN, Euclidean, Space
 
 Law = Callable[..., Gaussian]
@@ -61,10 +61,9 @@ class Taylor:
         linear_form = getattr(law, "linear_form", None)
         if linear_form is not None:
             matrix, offset, noise = linear_form(u, dt)
-            if 2 < matrix.dim() <= belief.mean.dim():  # one matrix a run meets several Gaussians a run
-                matrix = matrix.unsqueeze(-3)
-                offset = offset if offset is None or offset.dim() == 1 else offset.unsqueeze(-2)
-                noise = noise if noise.dim() == 2 else noise.unsqueeze(-3)
+            lead = belief.mean.dim() - 1  # one matrix a run may meet several Gaussians a run
+            matrix, noise = for_points(matrix, 2, lead), for_points(noise, 2, lead)
+            offset = offset if offset is None else for_points(offset, 1, lead)
             mean = apply_factor(matrix, belief.mean)
             return Linearization(
                 mean if offset is None else mean + offset, matrix @ belief.factor(), None, noise, law_space(law)
