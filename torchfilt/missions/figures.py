@@ -1,6 +1,7 @@
 """Figures of the studies, drawn without pyplot: no global figure state. Matplotlib loads when called."""
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Array = np.ndarray
-# Okabe-Ito colours: told apart without red and green.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# Okabe-Ito colours and a brown: told apart without red and green.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C5A2B")
 TRUTH = "0.45"
 
 
@@ -63,7 +64,7 @@ def plot_error_norms(
         time_h: (t,). errors: name -> (t, R, k), drawn as the root mean square over runs and over ``window`` epochs.
         bound: (t,) root of the trace of a bound. label: of the y axis.
     """
-    for k, (colour, (name, error)) in enumerate(zip(COLOURS, errors.items(), strict=False)):
+    for k, (colour, (name, error)) in enumerate(zip(cycle(COLOURS), errors.items(), strict=False)):
         square = np.mean(np.sum(error**2, -1), 1)
         kernel = np.ones(window)
         smooth = np.convolve(square, kernel, "same") / np.convolve(np.ones_like(square), kernel, "same")
@@ -83,7 +84,7 @@ def plot_path(
     """Projection of the true path (t, 3) and of estimated ones, equal scales."""
     first, second = axes
     ax.plot(truth[:, first], truth[:, second], color=TRUTH, lw=3, alpha=0.6, label="true path")
-    for colour, (name, path) in zip(COLOURS, estimates.items(), strict=False):
+    for colour, (name, path) in zip(cycle(COLOURS), estimates.items(), strict=False):
         ax.plot(path[:, first], path[:, second], lw=0.8, color=colour, label=name)
     ax.plot(*truth[0, [first, second]], "o", ms=5, color="0.2", label="start")
     # A square window around the truth: a filter that lost its satellite must not shrink the picture to a point.
@@ -147,7 +148,7 @@ def _path_figure(results: dict[str, Arrays], scene: Scene, title: str) -> Any:
     centre = truth[rows][len(truth[rows]) // 2]
     near = {name: path[rows] - centre for name, path in estimates.items()}
     close.plot(truth[rows, 1] - centre[1], truth[rows, 0] - centre[0], ".-", color=TRUTH, lw=2.5, alpha=0.6, ms=9)
-    for colour, path in zip(COLOURS, near.values(), strict=False):
+    for colour, path in zip(cycle(COLOURS), near.values(), strict=False):
         close.plot(path[:, 1], path[:, 0], ".-", lw=0.8, ms=5, color=colour)
     span = 1.3 * np.median([np.abs(path[:, 0]).max() for path in near.values()])
     close.set_title(f"x over y, close up at {scene.time_s[rows][len(truth[rows]) // 2] / 3600:.2f} h", fontsize=10)
