@@ -75,6 +75,52 @@ def test_a_diagonal_prior():
     assert torch.equal(one.covariance, two.covariance)
 
 
+def test_the_covariance_of_a_mixture_holds_what_its_means_share():
+    """Law of total covariance, written out: components that are independent inside are not so across the mixture."""
+    weights, means = np.array([0.2, 0.5, 0.3]), np.array([[0.0, 1.0], [2.0, 3.0], [-1.0, 0.5]])
+    mean = weights @ means
+    expected = COVARIANCE.numpy() + sum(w * np.outer(m - mean, m - mean) for w, m in zip(weights, means, strict=True))
+    joint = td.MultivariateNormal(tensor(means), COVARIANCE)
+    found = as_gaussian(td.MixtureSameFamily(td.Categorical(tensor(weights)), joint))
+    torch.testing.assert_close(found.covariance, tensor(expected), rtol=0, atol=1e-15)
+    torch.testing.assert_close(found.mean, tensor(mean), rtol=0, atol=1e-15)
+
+
+def test_a_scalar_law_is_a_state_of_one_number():
+    own = tf.Gaussian(tensor([0.5]), tensor([[2.0]]))
+    walk = tf.LinearGaussian(EYE[:1, :1], 0.1 * EYE[:1, :1])
+    y = tensor([[1.0], [0.5]])
+    one, two = (tf.KalmanFilter(tf.StateSpaceModel(p, walk, walk))(y) for p in (own, td.Normal(own.mean[0], 2.0)))
+    torch.testing.assert_close(one.log_likelihood, two.log_likelihood, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("particles", [3, 5])  # 3 particles and 3 rows: nothing may be paired by accident
+def test_priors_of_each_row_reach_the_particles(particles):
+    """Deviations of each row give the same draws as their factors; a torch law draws each row about its own mean."""
+    deviations = tensor([[1.0, 2.0], [10.0, 20.0], [100.0, 200.0]])
+    mean = torch.zeros(3, 2, dtype=torch.float64)
+    priors = [
+        tf.Gaussian(mean, deviations, is_diagonal=True),
+        tf.Gaussian(mean, torch.diag_embed(deviations)),
+        tf.Gaussian(mean[0], torch.diag_embed(deviations)),
+    ]
+    clouds = [
+        tf.BootstrapFilter(tf.StateSpaceModel(prior, WALK, WALK), particles).init((3,)).belief for prior in priors
+    ]
+    assert clouds[0].x.shape == (3, particles, 2)
+    for cloud in clouds[1:]:
+        assert torch.equal(cloud.x, clouds[0].x)
+    far = tensor([[0.0, 1e4], [2e4, 3e4], [4e4, 5e4]])
+    for law in (td.MultivariateNormal(far, EYE), td.Normal(far, 1.0)):
+        filter = tf.BootstrapFilter(tf.StateSpaceModel(law, WALK, WALK), particles)
+        x = filter.init((3,)).belief.x
+        assert ((x - far.unsqueeze(-2)).abs() < 7).all() and len(x.unique()) == x.numel()
+        with pytest.raises(ValueError, match=r"the prior is for a batch of \(3,\), not \(4,\)"):
+            filter.init((4,))
+    with pytest.raises(ValueError, match=r"the prior is for a batch of \(3,\), not \(4,\)"):
+        tf.KalmanFilter(tf.StateSpaceModel(priors[2], WALK, WALK)).init((4,))
+
+
 def test_gaussian_filters_take_torch_laws_by_their_moments():
     """A law that returns a MultivariateNormal is the same filter; a Student law is the Gaussian of its variance."""
 
@@ -194,6 +240,8 @@ PRIOR_PARTS = {
     "size of the factor": ({"scale_tril": EYE[:1, :1]}, rf"{NAME} end in 2, got \(1, 1\)"),
     "factor not square": ({"scale_tril": EYE[:1]}, rf"{NAME} be a square matrix .*\(1, 2\)"),
     "factor not lower": ({"scale_tril": COVARIANCE}, rf"{NAME} be lower triangular, entry \(0, 1\) is 0\.2"),
+    "scalar mean": ({"mean": PRIOR.mean[0]}, r"initial mean must be \(\*batch, d\) on Euclidean.*got \(\)"),
+    "size on the space": ({"space": tf.UnitQuaternion()}, r"initial mean must be \(\*batch, 4\) on Unit.*got \(2,\)"),
     "quaternion": ({"mean": tensor([0.0, 0, 0, 1]), "space": tf.UnitQuaternion()}, rf"{NAME} end in 3, got \(2, 2\)"),
 }
 
@@ -216,10 +264,43 @@ def test_a_transition_onto_another_space_is_refused():
     """A heading with a plain transition law would silently become a number."""
     angle = tf.Gaussian(tensor([3.0]), EYE[:1, :1], tf.Angle())
     law = tf.AdditiveGaussian(lambda x: x, EYE[:1, :1])
-    for build in (tf.ExtendedKalmanFilter, tf.UnscentedKalmanFilter):
+    joint = {"pooled": False, "split": 0.0, "weights": "joint"}
+    for build in (
+        tf.ExtendedKalmanFilter,
+        tf.UnscentedKalmanFilter,
+        lambda model: tf.BootstrapFilter(model, 10),
+        lambda model: tf.UnscentedParticleFilter(model, 10, **joint),
+    ):
         filter = build(tf.StateSpaceModel(angle, law, law))
         with pytest.raises(ValueError, match=r"the transition law .* Euclidean.*Angle"):
             filter(tensor([[3.0]]))
+
+
+def test_a_torch_transition_leaves_particles_on_their_space():
+    """Across the cut of an angle the mean stays at the cut; taken for numbers it would lie on the other side."""
+    angle = tf.Gaussian(tensor([3.1]), 0.3 * EYE[:1, :1], tf.Angle())
+    sight = tf.AdditiveGaussian(lambda x: x, 0.05 * EYE[:1, :1], tf.Angle())
+    model = tf.StateSpaceModel(angle, lambda x: td.Normal(x, 0.1, validate_args=False), sight)
+    history = tf.BootstrapFilter(model, 200)(tensor([[3.12], [-3.12]]))
+    assert history.space == tf.Angle()
+    assert (tf.Angle().local(tensor([math.pi]), history.mean).abs() < 0.3).all()
+
+
+@pytest.mark.parametrize("law", [lambda x: td.Normal(x, 1.0), lambda x: td.Normal(x[..., 0], 1.0)])
+def test_measurements_of_another_size_than_a_torch_law_are_refused(law):
+    """Three numbers would otherwise be compared with the only one, without a word."""
+    x, y = torch.zeros(4, 2, 1, dtype=torch.float64), torch.zeros(4, 1, 3, dtype=torch.float64)
+    for missing in ("none", "rows"):
+        with pytest.raises(ValueError, match="the measurement has 3 numbers"):
+            log_prob(law(x), y, missing)
+
+
+def test_missing_components_of_a_law_without_a_mean_have_finite_gradients():
+    scale = tensor(0.3).requires_grad_()
+    value = log_prob(td.Cauchy(tensor([0.0, 1.0]), scale), tensor([0.5, math.nan]))
+    (gradient,) = torch.autograd.grad(value, scale)
+    (expected,) = torch.autograd.grad(td.Cauchy(0.0, scale).log_prob(tensor(0.5)), scale)
+    torch.testing.assert_close(gradient, expected, rtol=1e-14, atol=0)
 
 
 def test_copies_precision_and_state():

@@ -84,10 +84,15 @@ class StateSpaceModel(nn.Module):
             ValueError: it has a batch of its own, which is not ``batch_shape``.
         """
         prior = as_gaussian(self.initial())
-        lead = prior.mean.shape[:-1]
-        if lead and batch_shape is not None and lead != torch.Size(batch_shape):
-            raise ValueError(f"the prior is for a batch of {tuple(lead)}, not {tuple(batch_shape)}")
+        own = prior.scale_tril.shape[: -1 if prior.is_diagonal else -2]
+        check_batch(torch.broadcast_shapes(prior.mean.shape[:-1], own), batch_shape)
         return prior
+
+
+def check_batch(lead: torch.Size, batch_shape: tuple[int, ...] | None) -> None:
+    """Raise a ValueError where a prior with leading dims of its own is asked for another batch."""
+    if lead and batch_shape is not None and lead != torch.Size(batch_shape):
+        raise ValueError(f"the prior is for a batch of {tuple(lead)}, not {tuple(batch_shape)}")
 
 
 class InitialLaw(nn.Module):
@@ -104,6 +109,9 @@ class InitialLaw(nn.Module):
             return
         if not isinstance(law, Gaussian):
             raise TypeError(f"initial must be a Gaussian, a torch Distribution or a module, got {type(law).__name__}")
+        if law.mean.dim() == 0 or law.space.size not in (None, law.mean.shape[-1]):
+            size = "d" if law.space.size is None else law.space.size
+            raise ValueError(f"initial mean must be (*batch, {size}) on {law.space!r}, got {tuple(law.mean.shape)}")
         check_finite(law.mean, "initial mean")
         check_finite(law.scale_tril, "initial scale_tril")
         expected = law.space.tangent_size if law.space.tangent_size is not None else law.mean.shape[-1]
@@ -139,10 +147,23 @@ def as_gaussian(law: Conditional) -> Gaussian:
         raise TypeError(f"a law must return a Gaussian or a torch Distribution, got {type(law).__name__}")
     if isinstance(law, torch.distributions.MultivariateNormal):
         return Gaussian(law.loc, law.scale_tril)
+    if isinstance(law, torch.distributions.MixtureSameFamily) and law.event_shape:
+        return Gaussian(law.mean, psd_factor(_mixture_covariance(law)))
     covariance = getattr(law, "covariance_matrix", None)
     if covariance is not None:
         return Gaussian(law.mean, psd_factor(covariance))
-    return Gaussian(law.mean, law.variance.sqrt(), is_diagonal=True)
+    mean, variance = law.mean, law.variance
+    if mean.dim() == 0:  # a scalar law is a state of one number
+        mean, variance = mean.unsqueeze(-1), variance.unsqueeze(-1)
+    return Gaussian(mean, variance.sqrt(), is_diagonal=True)
+
+
+def _mixture_covariance(law: torch.distributions.MixtureSameFamily) -> Tensor:
+    """Covariance (..., e, e): components that are independent inside are not so across the mixture."""
+    parts = as_gaussian(law.component_distribution)
+    apart = parts.mean - law.mean.unsqueeze(-2)
+    each = parts.covariance + apart.unsqueeze(-1) * apart.unsqueeze(-2)
+    return (law.mixture_distribution.probs[..., None, None] * each).sum(-3)
 
 
 def log_prob(law: Conditional, y: Tensor, missing: Missing = "rows") -> Tensor:
@@ -157,15 +178,21 @@ def log_prob(law: Conditional, y: Tensor, missing: Missing = "rows") -> Tensor:
         ValueError: y has another size than the law, or a joint torch Distribution would have to drop only some of its
             components.
     """
+    if isinstance(law, torch.distributions.MultivariateNormal) and missing != "none":
+        law = as_gaussian(law)  # joint, but its margins are known
     if isinstance(law, Gaussian):
         if y.shape[-1] != law.mean.shape[-1]:
             raise ValueError(f"the measurement has {y.shape[-1]} numbers, the observation law {law.mean.shape[-1]}")
         return law.log_prob(y, None if missing == "none" else law.space.observed(y))
+    shape = (*law.batch_shape, *law.event_shape)
+    if shape[-1:] != y.shape[-1:]:
+        raise ValueError(f"the measurement has {y.shape[-1]} numbers, a draw of the observation law is {shape}")
     if missing == "none":
         value = law.log_prob(y)
         return value if law.event_shape else value.sum(-1)
     observed = ~torch.isnan(y)
-    value = law.log_prob(torch.where(observed, y, law.mean.detach()))
+    # Any number of the support will do; laws without a mean, such as Cauchy's, have 0 in it.
+    value = law.log_prob(torch.where(observed, y, law.mean.detach().nan_to_num(0, 0, 0)))
     if not law.event_shape:
         return torch.where(observed, value, 0).sum(-1)
     if not (observed.all(-1) | ~observed.any(-1)).all():

@@ -268,11 +268,16 @@ def law_space(law: object) -> Space:
     return getattr(law, "space", EUCLIDEAN)
 
 
+def check_transition_space(after: Space, before: Space) -> None:
+    """Raise a ValueError where the state would leave its space."""
+    if after != before and not type(after) is type(before) is Euclidean:
+        raise ValueError(f"the transition law gives a state on {after!r}, the belief lives on {before!r}")
+
+
 def predict(law: Law, belief: Gaussian, rule: Rule, u: Tensor | None, dt: Tensor | float | None) -> Gaussian:
     """Belief pushed through a transition law."""
     line = rule.linearize(law, belief, u, dt)
-    if line.space != belief.space and not type(line.space) is type(belief.space) is Euclidean:
-        raise ValueError(f"the transition law gives a state on {line.space!r}, the belief lives on {belief.space!r}")
+    check_transition_space(line.space, belief.space)
     if line.mean.shape[-1] != belief.mean.shape[-1]:
         raise ValueError(f"the transition law turns {belief.mean.shape[-1]} state numbers into {line.mean.shape[-1]}")
     factor = triangularize(cat_columns(line.slope, line.spread()))

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.linalg import apply_factor, steady_triangularize
 from torchfilt.model import Conditional, StateSpaceModel, as_gaussian, log_prob, sample
-from torchfilt.moments import Missing, Rule, predict, update
+from torchfilt.moments import Missing, Rule, check_transition_space, predict, update
 from torchfilt.particles import Particles, uniform_log_weights
 from torchfilt.spaces import EUCLIDEAN, Space, weighted_sum
 from torchfilt.types import StepNoise
@@ -64,7 +64,7 @@ class Prior:
         if move:
             assert noise.proposal is not None
             law = model.conditional("transition", x, u, dt)
-            x, space = sample(law, noise.proposal, noise.seed), _space_of(law)
+            x, space = sample(law, noise.proposal, noise.seed), _next_space(law, space)
         return Proposed(x, None, log_prob(model.conditional("observation", x), y, missing), space)
 
 
@@ -249,10 +249,11 @@ class Local:
             return predicted, predicted
         law = model.conditional("transition", particles.x, u, dt)
         step = as_gaussian(law)
+        space = _next_space(law, particles.space)
         factor = step.factor()
         if factor.dim() == 2:  # shared by everyone: what particles carry has a row and a particle axis
             factor = factor.expand(*particles.x.shape[:-2], 1, -1, -1)
-        return step._replace(scale_tril=factor, is_diagonal=False), law
+        return Gaussian(step.mean, factor, space), law
 
 
 def _equal_weights(x: Tensor, factor: Tensor | None, space: Space) -> Particles:
@@ -261,3 +262,11 @@ def _equal_weights(x: Tensor, factor: Tensor | None, space: Space) -> Particles:
 
 def _space_of(law: Conditional) -> Space:
     return law.space if isinstance(law, Gaussian) else EUCLIDEAN
+
+
+def _next_space(law: Conditional, before: Space) -> Space:
+    """Space after the motion; a torch Distribution knows of none and leaves particles where they are."""
+    if not isinstance(law, Gaussian):
+        return before
+    check_transition_space(law.space, before)
+    return law.space

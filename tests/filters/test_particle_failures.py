@@ -95,14 +95,35 @@ def test_joint_distribution_with_some_components_missing_is_refused():
 
     class Joint(torch.nn.Module):
         def forward(self, x):
-            return torch.distributions.MultivariateNormal(x, torch.eye(2, dtype=x.dtype), validate_args=False)
+            return torch.distributions.Independent(torch.distributions.Laplace(x, 1.0, validate_args=False), 1)
 
     linear = state_space(PLANE)
     model = tf.StateSpaceModel(linear.initial, linear.transition, Joint())
     filter = tf.BootstrapFilter(model, 50)
     assert filter(tensor([[0.1, 0.2], [np.nan, np.nan]]), seed=1).diagnostics.log_likelihood[1] == 0
-    with pytest.raises(ValueError, match="MultivariateNormal is joint over its components"):
+    with pytest.raises(ValueError, match="Independent is joint over its components"):
         filter(tensor([[0.1, np.nan]]), seed=1)
+
+
+def test_a_multivariate_normal_loses_components_exactly():
+    """Its margins are known: the same bits as with our own Gaussian."""
+
+    class Joint(torch.nn.Module):
+        def __init__(self, own):
+            super().__init__()
+            self.own = own
+
+        def forward(self, x):
+            factor = torch.tensor([[1.0, 0.0], [0.8, 0.3]], dtype=x.dtype)
+            if self.own:
+                return tf.Gaussian(x, factor)
+            return torch.distributions.MultivariateNormal(x, scale_tril=factor, validate_args=False)
+
+    linear = state_space(PLANE)
+    models = [tf.StateSpaceModel(linear.initial, linear.transition, Joint(own)) for own in (True, False)]
+    ys = tensor([[[0.1, 0.2], [0.3, np.nan]], [[np.nan, np.nan], [0.3, 0.2]]])
+    one, two = (tf.BootstrapFilter(model, 50)(ys, seed=1).log_likelihood for model in models)
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
 
 
 class StudentSight(torch.nn.Module):

@@ -8,7 +8,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.model import Conditional, StateSpaceModel
+from torchfilt.linalg import for_points
+from torchfilt.model import Conditional, StateSpaceModel, check_batch
 from torchfilt.moments import Missing, Rule, unscented
 from torchfilt.moves import MetropolisHastings
 from torchfilt.noise import NoiseSource
@@ -85,6 +86,8 @@ class ParticleFilter(Filter[Particles]):
         initial = self.model.initial()
         if isinstance(initial, Gaussian):
             self.model.prior(batch_shape)
+        else:
+            check_batch(initial.batch_shape[: None if initial.event_shape else -1], batch_shape)
         shape = (*batch_shape, self.particles)
         source = NoiseSource(seed, self.fast_normals)
         like = initial.mean
@@ -138,7 +141,7 @@ class ParticleFilter(Filter[Particles]):
             belief = self.proposal.refresh(belief, noise.redraw, chosen)
         else:
             belief = by_component(belief)
-            ancestors = torch.arange(self.particles, device=belief.x.device).expand_as(belief.log_weights)
+            ancestors = torch.arange(belief.x.shape[-2], device=belief.x.device).expand_as(belief.log_weights)
         u = u.unsqueeze(-2) if u is not None and u.dim() > 1 else u
         dt = dt.unsqueeze(-2) if isinstance(dt, Tensor) and dt.dim() > 1 else dt
         y = y.unsqueeze(-2)
@@ -234,19 +237,20 @@ def _tangent_size(initial: Conditional) -> int:
 def _draw_initial(initial: Conditional, noise: Tensor, shape: tuple[int, ...], seed: int) -> Tensor:
     if isinstance(initial, Gaussian):
         mean = initial.mean if initial.mean.dim() == 1 else initial.mean.unsqueeze(-2)
-        factor = initial.factor() if initial.scale_tril.dim() <= 2 else initial.factor().unsqueeze(-3)
+        factor = for_points(initial.factor(), 2, len(shape))
         return Gaussian(mean.expand(*shape, -1), factor, initial.space).sample(noise)
     return _draw_distribution(initial, shape, seed)
 
 
 def _draw_distribution(law: Distribution, shape: tuple[int, ...], seed: int) -> Tensor:
     """Draws (*shape, d) of a torch Distribution under its own seed; the global generator is put back."""
-    own = law.batch_shape if not law.event_shape else torch.Size()
-    wide: Any = law.expand(torch.Size((*shape, *own)))
+    own = law.batch_shape[-1:] if not law.event_shape else torch.Size()
+    wide: Any = law.expand(torch.Size((*shape[:-1], *own)))
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        draws: Tensor = wide.rsample() if wide.has_rsample else wide.sample()
-    return draws if law.event_shape or law.batch_shape else draws.unsqueeze(-1)
+        draws: Tensor = wide.rsample(shape[-1:]) if wide.has_rsample else wide.sample(shape[-1:])
+    draws = draws if law.event_shape or law.batch_shape else draws.unsqueeze(-1)
+    return draws.movedim(0, -2)
 
 
 def BootstrapFilter(
