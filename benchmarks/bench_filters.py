@@ -7,7 +7,7 @@ filtered mean at every step; rows that do less are marked with *. Outputs are co
 `--write` puts the result here:
 
 -- last result --
-2026-11-24, one thread of a x86_64 processor with AVX-512, 2 cores, Linux
+2026-11-25, one thread of a x86_64 processor with AVX-512, 2 cores, Linux
 python 3.11.7, torch 2.13.0+cpu, torchfilt 0.1.0, numpy 2.4.6, filterpy 2.0.0, torch-kf 0.4.3
 
 Bootstrap filter, 6 states, 3 measured, systematic resampling at every step, 50 steps.
@@ -15,18 +15,18 @@ ns a particle and step (ratio to the bare in-place loop of the same precision, o
 
                                           n = 1e3     n = 1e4     n = 1e5
 -------------------------------------  ----------  ----------  ----------
-f32 torchfilt                          214 (3.31)   60 (1.91)   43 (1.49)
-f32 torchfilt, covariance too          229 (3.54)   69 (2.20)   54 (1.85)
-f32 bare torch, in place                65 (1.00)   31 (1.00)   29 (1.00)
-f32 bare torch, naive                  156 (2.42)  118 (3.77)  109 (3.79)
-f64 torchfilt, fast normals            213 (2.66)   72 (1.54)   77 (1.42)
-f64 bare torch, in place, f32 normals   80 (1.00)   47 (1.00)   54 (1.00)
-f64 torchfilt                          289 (1.86)  165 (1.31)  148 (1.15)
-f64 torchfilt, covariance too          346 (2.22)  220 (1.74)  171 (1.33)
-f64 bare torch, in place               155 (1.00)  126 (1.00)  129 (1.00)
-f64 bare torch, naive                  241 (1.55)  212 (1.68)  198 (1.54)
-f64 filterpy resampler + NumPy         319 (2.05)  296 (2.34)  289 (2.25)
-f64 particles                          243 (1.56)  158 (1.25)  164 (1.28)
+f32 torchfilt                          196 (3.18)   47 (1.72)   34 (1.37)
+f32 torchfilt, covariance too          202 (3.29)   54 (1.98)   43 (1.75)
+f32 bare torch, in place                62 (1.00)   27 (1.00)   25 (1.00)
+f32 bare torch, naive                  150 (2.43)  105 (3.87)  104 (4.20)
+f64 torchfilt, fast normals            196 (2.54)   66 (1.48)   68 (1.45)
+f64 bare torch, in place, f32 normals   77 (1.00)   45 (1.00)   47 (1.00)
+f64 torchfilt                          268 (1.80)  144 (1.25)  144 (1.21)
+f64 torchfilt, covariance too          302 (2.03)  163 (1.42)  160 (1.35)
+f64 bare torch, in place               149 (1.00)  115 (1.00)  119 (1.00)
+f64 bare torch, naive                  230 (1.55)  187 (1.63)  189 (1.59)
+f64 filterpy resampler + NumPy         307 (2.06)  290 (2.52)  287 (2.41)
+f64 particles                          221 (1.49)  141 (1.23)  155 (1.30)
 
 ATen calls a step: torchfilt 59 (19 of them views), bare in place 33 (7).
 
@@ -35,14 +35,14 @@ ns a series and step (ratio to torchfilt with a covariance a row):
 
                                             1 series       100 series    10,000 series
 -----------------------------------  ---------------  ---------------  ---------------
-torchfilt                            184,550 (0.888)    2,153 (0.499)       89 (0.045)
-torchfilt, covariance too            187,711 (0.904)    2,225 (0.516)       92 (0.047)
-torchfilt f32                        190,876 (0.919)    1,998 (0.464)       59 (0.030)
-torchfilt, a covariance a row        207,715 (1.000)    4,310 (1.000)    1,957 (1.000)
-torch, the obvious batch              63,805 (0.307)    2,027 (0.470)    1,249 (0.638)
-torch-kf*                             55,487 (0.267)    1,527 (0.354)      952 (0.486)
-filterpy                              63,991 (0.308)  65,065 (15.095)  62,118 (31.745)
-torchfilt, a tenth missing anywhere  219,942 (1.059)    5,740 (1.332)    2,207 (1.128)
+torchfilt                            130,508 (0.872)    1,399 (0.440)       38 (0.018)
+torchfilt, covariance too            132,584 (0.886)    1,400 (0.441)       39 (0.019)
+torchfilt f32                        130,798 (0.874)    1,386 (0.436)       28 (0.013)
+torchfilt, a covariance a row        149,611 (1.000)    3,179 (1.000)    2,068 (1.000)
+torch, the obvious batch              55,457 (0.371)    1,756 (0.552)    1,186 (0.573)
+torch-kf*                             48,768 (0.326)    1,361 (0.428)      892 (0.431)
+filterpy                              57,442 (0.384)  56,650 (17.820)  57,068 (27.598)
+torchfilt, a tenth missing anywhere  152,498 (1.019)    4,092 (1.287)    1,878 (0.908)
 
 * no log-likelihood. filterpy ran over at most 3 series, scaled.
 
@@ -51,18 +51,18 @@ ns a series and step (ratio to filterpy, which ran over at most 3 series, scaled
 
                       1 series       100 series    10,000 series
 -------------  ---------------  ---------------  ---------------
-filterpy       413,755 (1.000)  443,245 (1.000)  397,705 (1.000)
-torchfilt      724,660 (1.751)   11,828 (0.027)    3,182 (0.008)
-torchfilt f32  703,143 (1.699)    9,245 (0.021)    2,386 (0.006)
+filterpy       358,702 (1.000)  363,501 (1.000)  397,247 (1.000)
+torchfilt      525,230 (1.464)    8,020 (0.022)    2,742 (0.007)
+torchfilt f32  490,309 (1.367)    7,236 (0.020)    2,241 (0.006)
 
 Unscented particle filter, 6 states, one series: ns a particle and step.
 
                   ns
 -------------  -----
-f64, n = 200   8,649
-f32, n = 200   7,914
-f64, n = 1000  5,619
-f32, n = 1000  5,157
+f64, n = 200   6,988
+f32, n = 200   6,781
+f64, n = 1000  4,890
+f32, n = 1000  4,564
 -- end of the last result --
 """
 
