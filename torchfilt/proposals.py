@@ -17,6 +17,7 @@ from torchfilt.types import StepNoise
 Step = Tensor | float | None
 Evidence = Literal["unbiased", "linearized", "approximate"]
 Redraw = Literal["never", "resample", "always"]
+Weights = Literal["marginal", "joint"]
 
 
 class Proposed(NamedTuple):
@@ -101,7 +102,7 @@ class Local:
     redraw: Redraw = "never"
     split: float | None = 0.5
     pooled: bool = False
-    weights: Literal["marginal", "joint"] = "marginal"
+    weights: Weights = "marginal"
 
     def __post_init__(self) -> None:
         if self.redraw not in ("never", "resample", "always"):
@@ -122,7 +123,7 @@ class Local:
     @property
     def evidence(self) -> Evidence:
         """What the log-likelihood is worth, see `torchfilt.run.Filter`."""
-        if self.pooled or (self.split is None and self.redraw != "never"):
+        if self.pooled or self.split is None:
             return "approximate"
         return "unbiased" if self.weights == "joint" else "linearized"
 

@@ -272,8 +272,18 @@ def test_literal_joint_form_is_worse_than_exact_too():
 
 def test_labels_of_the_evidence():
     model = state_space(PLANE)
-    assert tf.LocallyLinearizedParticleFilter(model).evidence in ("unbiased", "linearized")
+    assert tf.LocallyLinearizedParticleFilter(model).evidence == "unbiased"
     curved = curved_problem("gaussian")[0]
     assert tf.LocallyLinearizedParticleFilter(curved).evidence == "linearized"
-    assert tf.LocallyLinearizedParticleFilter(curved, split=None, redraw="never").evidence == "linearized"
+    assert tf.LocallyLinearizedParticleFilter(curved, split=None, redraw="never").evidence == "approximate"
     assert tf.LocallyLinearizedParticleFilter(curved, split=None, redraw="resample").evidence == "approximate"
+
+
+def test_literal_start_alone_counts_the_prior_twice():
+    """Never redrawn, but drawn from all of P_0 and carrying all of it: one step tells, without resampling."""
+    ys, exact = series(1)
+    filter = tf.LocallyLinearizedParticleFilter(state_space(PLANE), 1000, split=None, redraw="never")
+    history = filter(replicate(ys, 100), seed=23, record="mean")
+    assert filter.evidence == "approximate"
+    score, _, _ = bias_score(history.log_likelihood, exact.log_likelihood.sum())
+    assert abs(score) > 10

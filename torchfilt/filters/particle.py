@@ -14,7 +14,7 @@ from torchfilt.moments import Missing, Rule, unscented
 from torchfilt.moves import MetropolisHastings
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
-from torchfilt.proposals import Local, Prior, Proposed, Redraw
+from torchfilt.proposals import Local, Prior, Proposed, Redraw, Weights
 from torchfilt.resampling import Resampler, by_component, ess_below, gather_particles, systematic
 from torchfilt.run import Filter, Step
 from torchfilt.types import FilterState, StepInfo, StepNoise
@@ -274,7 +274,7 @@ def UnscentedParticleFilter(
     split: float | None = 0.6,
     redraw: Redraw = "always",
     pooled: bool = True,
-    weights: str = "marginal",
+    weights: Weights = "marginal",
     resampler: Resampler | None = None,
     move: MetropolisHastings | None = None,
 ) -> ParticleFilter:
@@ -286,7 +286,7 @@ def UnscentedParticleFilter(
 
     Sources: van der Merwe, Doucet, de Freitas, Wan, NIPS 13 (2000); Wei, Song, Zhang (2012), equation 7.
     """
-    local = Local(rule or unscented(), redraw, split, pooled, weights)  # type: ignore[arg-type]
+    local = Local(rule or unscented(), redraw, split, pooled, weights)
     return ParticleFilter(model, particles, local, resampler or ess_below(0.5), move)
 
 
@@ -297,7 +297,7 @@ def LocallyLinearizedParticleFilter(
     split: float | None = 0.5,
     redraw: Redraw = "never",
     pooled: bool = False,
-    weights: str = "marginal",
+    weights: Weights = "marginal",
     resampler: Resampler | None = None,
 ) -> ParticleFilter:
     """A bank of Gaussian filters with weights: the same loop and proposal as the unscented particle filter.
@@ -305,5 +305,5 @@ def LocallyLinearizedParticleFilter(
     Particles start as draws that hold the share 1 - split of the prior's covariance and are not redrawn, because
     drawing from a covariance that is also kept counts it twice.
     """
-    local = Local(rule or unscented(), redraw, split, pooled, weights)  # type: ignore[arg-type]
+    local = Local(rule or unscented(), redraw, split, pooled, weights)
     return ParticleFilter(model, particles, local, resampler or ess_below(0.5))
