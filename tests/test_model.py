@@ -210,8 +210,11 @@ def test_densities_with_missing_components():
     np.testing.assert_allclose(log_prob(laplace, y).numpy(), np.nansum(parts, -1), rtol=0, atol=1e-14)
     joint = td.MultivariateNormal(PRIOR.mean.expand(2, 2), COVARIANCE)
     np.testing.assert_allclose(log_prob(joint, y[[0, 3]]).numpy(), [expected[0], 0.0], rtol=0, atol=1e-14)
-    with pytest.raises(ValueError, match="MultivariateNormal is joint over its components"):
-        log_prob(joint, y[:2])
+    found = log_prob(td.MultivariateNormal(PRIOR.mean.expand(4, 2), COVARIANCE), y)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=1e-14)
+    parts = td.MixtureSameFamily(td.Categorical(torch.ones(1)), td.MultivariateNormal(PRIOR.mean[None], COVARIANCE))
+    with pytest.raises(ValueError, match="MixtureSameFamily is joint over its components"):
+        log_prob(parts, y[:2])
     with pytest.raises(ValueError, match="measurement has 1 numbers, the observation law 2"):
         log_prob(PRIOR, y[:, :1])
 
