@@ -1,6 +1,8 @@
 """Moment rules against numerical integration, and what each of them is exact for."""
 
+import copy
 import math
+import pickle
 from itertools import pairwise
 
 import numpy as np
@@ -352,6 +354,20 @@ def test_refusals():
         predict(law, belief([0.0, 0.0], np.eye(2)), taylor(), None, None)
     with pytest.raises(ValueError, match="measurement has 2 numbers, the observation law gives 1"):
         update(law, belief([0.0, 0.0], np.eye(2)), tensor([0.0, 1.0]), taylor())
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_rules_reach_another_process(name):
+    """Pickled and copied they are the same rule; so are filters that hold them."""
+    rule = RULES[name]
+    eye = torch.eye(2, dtype=torch.float64)
+    law = tf.AdditiveGaussian(torch.sin, eye)
+    model = tf.StateSpaceModel(tf.Gaussian(eye[0], eye), law, law)
+    y = tensor([[0.3, 0.1], [0.2, 0.5]])
+    for filter in (tf.GaussianFilter(model, rule), tf.LocallyLinearizedParticleFilter(model, 5, rule)):
+        expected = filter(y)
+        for twin in (pickle.loads(pickle.dumps(filter)), copy.deepcopy(filter)):
+            assert torch.equal(twin(y).mean, expected.mean)
 
 
 def test_rules_are_held_once_and_do_not_leak_precision():

@@ -195,6 +195,13 @@ def test_constructor_errors_name_the_rule():
         tf.UnscentedParticleFilter(model, 10, move=tf.moves.MetropolisHastings())
     with pytest.raises(TypeError, match="model must be a StateSpaceModel"):
         tf.BootstrapFilter("model")
+    with pytest.raises(TypeError, match="model must be a StateSpaceModel"):
+        tf.KalmanFilter("model")
+    with pytest.raises(TypeError, match=r"resampler must be a Resampler.*got 'systematic'"):
+        tf.BootstrapFilter(model, 10, "systematic")
+    for build in (tf.GaussianFilter, lambda model, rule: tf.UnscentedParticleFilter(model, 10, rule)):
+        with pytest.raises(TypeError, match=r"rule must be a moment rule.*got 'unscented'"):
+            build(model, unscented)
     filter = tf.BootstrapFilter(model, 10)
     with pytest.raises(ValueError, match="needs its random numbers"):
         filter.advance(filter.init().belief, tensor([0.0]))

@@ -197,6 +197,10 @@ REFUSED = {
     "infinite number": ("dt", lambda t: math.inf, ValueError, "dt must be finite and >= 0, got inf"),
     "too few dt": ("dt", lambda t: t[:-1], ValueError, r"dt must be a number, \(8,\) or \(8, 3\), got \(7,\)"),
     "NaN control": ("u", lambda u: bad(u, (2, 0, 0), math.nan), ValueError, r"controls .* finite.*\(2, 0, 0\) is nan"),
+    "dt of rows in another dtype": ("dt", lambda t: t[:, None].expand(8, 3).float(), TypeError, f"dt {DTYPE}"),
+    "list of dt": ("dt", lambda t: t.tolist(), TypeError, "dt must be a number or a tensor, got list"),
+    "array": ("y", lambda y: y.numpy(), TypeError, "measurements must be a tensor, got ndarray"),
+    "array of controls": ("u", lambda u: u.numpy(), TypeError, "controls must be a tensor, got ndarray"),
     "too few controls": ("u", lambda u: u[:-1], ValueError, r"controls must be .* t = 8.*got \(7, 3, 1\)"),
     "one dim of controls": ("u", lambda u: u[:, 0, 0], ValueError, r"controls must be .*got \(8,\)"),
     "other batch of controls": ("u", lambda u: u[:, :2], ValueError, r"controls must be shared.*got \(8, 2, 1\)"),
@@ -231,6 +235,9 @@ STREAM = {
         ValueError,
         r"dt must be a number or \(3,\), got \(2,\)",
     ),
+    "dt of rows in another dtype": ("dt", lambda t: torch.ones(3), TypeError, f"dt {DTYPE}"),
+    "no dims": ("y", lambda y: y[0, 0], ValueError, r"y must be \(\*batch, m\), got a tensor without dims"),
+    "list": ("y", lambda y: y.tolist(), TypeError, "y must be a tensor, got list"),
     "NaN dt": ("dt", lambda t: tensor(math.nan), ValueError, "dt must be finite and >= 0.*nan"),
     "NaN control": ("u", lambda u: bad(u, (2, 0), math.nan), ValueError, r"u must be finite, entry \(2, 0\) is nan"),
     "other batch of controls": ("u", lambda u: u[:2], ValueError, r"u must be shared.*got \(2, 1\)"),
@@ -260,6 +267,29 @@ def test_measurements_for_another_batch_than_the_state_or_the_prior_are_refused(
     )
     with pytest.raises(ValueError, match=r"prior.*\(3,\).*\(2,\)"):
         tf.UnscentedKalmanFilter(rows)(ys[:, :2], us[:, :2], 0.5)
+
+
+def test_a_state_of_another_kind_of_filter_is_refused(filter):
+    ys, us, _ = data()
+    cloud = tf.BootstrapFilter(nonlinear(), 10)
+    with pytest.raises(TypeError, match="state must hold the Gaussian of this filter, got Particles"):
+        filter(ys, us, 0.5, state=cloud.init((ROWS,)))
+    with pytest.raises(TypeError, match="state must hold the Particles of this filter, got Gaussian"):
+        cloud.step(filter.init((ROWS,)), ys[0], us[0], 0.5)
+    with pytest.raises(TypeError, match=r"state must be a FilterState.*got Gaussian"):
+        filter.step(filter.init((ROWS,)).belief, ys[0], us[0], 0.5)
+
+
+def test_a_time_step_may_be_a_tensor_without_dims():
+    """The same as the number, in a series and in a stream, and its derivative is that of the difference quotient."""
+    filter = build("nonlinear", "unscented")
+    ys, us, _ = data()
+    same_history(filter(ys, us, tensor(0.5)), filter(ys, us, 0.5))
+    dt = tensor(0.5).requires_grad_()
+    (gradient,) = torch.autograd.grad(filter(ys, us, dt).log_likelihood.sum(), dt)
+    above, below = (filter(ys, us, 0.5 + sign * 1e-5).log_likelihood.sum() for sign in (1, -1))
+    # Truncation of order 1e-10, rounding 1e-15 |value| / 1e-5.
+    torch.testing.assert_close(gradient, (above - below) / 2e-5, rtol=1e-6, atol=1e-6)
 
 
 def test_a_filter_needs_a_model():

@@ -5,7 +5,7 @@ rest. A quadrature is data; Taylor is the exact derivative. For laws that are li
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -45,6 +45,13 @@ class Rule(Protocol):
     def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
         """See `Linearization`."""
         ...
+
+
+def check_rule_type(rule: object) -> None:
+    """Raise a TypeError unless this is a moment rule."""
+    if not hasattr(rule, "linearize"):
+        shown = rule if isinstance(rule, str) else getattr(rule, "__name__", type(rule).__name__)
+        raise TypeError(f"rule must be a moment rule, such as taylor() or unscented(), got {shown!r}")
 
 
 def lift(value: Tensor | float | None) -> Tensor | float | None:
@@ -100,10 +107,20 @@ class Quadrature(NamedTuple):
 
 @dataclass(frozen=True)
 class SigmaPoints:
-    """Statistical linearisation with a quadrature that is built for each dimension."""
+    """Statistical linearisation with a quadrature that is built for each dimension.
+
+    ``made_by``: function and arguments that give this rule again in another process; without it, ``build`` itself must
+    be found by its name there.
+    """
 
     name: str
     build: Callable[[int], Quadrature]
+    made_by: tuple[Callable[..., "SigmaPoints"], tuple[Any, ...]] | None = field(
+        default=None, repr=False, compare=False
+    )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.made_by or (SigmaPoints, (self.name, self.build))
 
     def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
         """One batched evaluation of the law at all nodes."""
@@ -222,7 +239,7 @@ def unscented(alpha: float = 1.0, beta: float = 0.0, kappa: float | None = None)
         spread = torch.cat([torch.tensor([central_spread], dtype=torch.float64), side])
         return Quadrature(nodes, mean_weights, spread, True, central_spread, central < 0)
 
-    return SigmaPoints("unscented", build)
+    return SigmaPoints("unscented", build, (unscented, (alpha, beta, kappa)))
 
 
 @lru_cache(maxsize=1)
@@ -234,7 +251,7 @@ def cubature() -> SigmaPoints:
         weights = torch.full((2 * size,), 0.5 / size, dtype=torch.float64)
         return Quadrature(torch.cat([eye, -eye]), weights, weights, True)
 
-    return SigmaPoints("cubature", build)
+    return SigmaPoints("cubature", build, (cubature, ()))
 
 
 @lru_cache(maxsize=16)
@@ -260,7 +277,7 @@ def gauss_hermite(order: int = 3) -> SigmaPoints:
         product = torch.cartesian_prod(*[weights] * size).reshape(-1, size).prod(-1)
         return Quadrature(grid, product, product, False)
 
-    return SigmaPoints("gauss_hermite", build)
+    return SigmaPoints("gauss_hermite", build, (gauss_hermite, (order,)))
 
 
 def law_space(law: object) -> Space:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.linalg import apply_factor, steady_triangularize
 from torchfilt.model import Conditional, StateSpaceModel, as_gaussian, log_prob, sample
-from torchfilt.moments import Missing, Rule, check_transition_space, predict, update
+from torchfilt.moments import Missing, Rule, check_rule_type, check_transition_space, predict, update
 from torchfilt.particles import Particles, uniform_log_weights
 from torchfilt.spaces import EUCLIDEAN, Space, weighted_sum
 from torchfilt.types import StepNoise
@@ -105,6 +105,7 @@ class Local:
     weights: Weights = "marginal"
 
     def __post_init__(self) -> None:
+        check_rule_type(self.rule)
         if self.redraw not in ("never", "resample", "always"):
             raise ValueError(f"redraw must be 'never', 'resample' or 'always', got {self.redraw!r}")
         if self.weights not in ("marginal", "joint"):

@@ -33,11 +33,11 @@ class Filter(nn.Module, Generic[B]):
     """
 
     evidence: Evidence = "exact"
+    carries: type[Gaussian] | type[Particles]
 
     def __init__(self, model: StateSpaceModel) -> None:
         super().__init__()
-        if not isinstance(model, StateSpaceModel):
-            raise TypeError(f"model must be a StateSpaceModel, got {type(model).__name__}")
+        check_model(model)
         self.model = model
 
     def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[B]:
@@ -100,14 +100,20 @@ class Filter(nn.Module, Generic[B]):
         Raises:
             FilterError: a row failed (``throw``). TypeError, ValueError: as in `forward`.
         """
+        self._check_state(state)
         batch = _batch_of(state.belief)
+        _check_tensor(y, "y")
+        if y.dim() == 0:
+            raise ValueError("y must be (*batch, m), got a tensor without dims")
         _check_measurements(y, state.belief, "y", y.shape[:-1])
         if u is not None:
+            _check_tensor(u, "u")
             _check_controls(u, y, "u", u.shape[:-1], batch)
         _check_step(dt)
         if isinstance(dt, Tensor):
             if dt.dim() and dt.shape != batch:
                 raise ValueError(f"dt must be a number or {tuple(batch)}, got {tuple(dt.shape)}")
+            _check_step_dtype(dt, y)
             dt = dt.unsqueeze(-1)
         missing = _missing_of(y)
         noise = self.draw(state.belief, state.step, state.seed)
@@ -134,10 +140,11 @@ class Filter(nn.Module, Generic[B]):
         Args:
             measurements: (t, *batch, m); NaN means not measured.
             controls: (t, k) shared by the batch, or (t, *batch, k).
-            dt: time steps, s: a number, (t,) or (t, *batch).
+            dt: time steps, s: a number (a tensor too), (t,) or (t, *batch).
             predict_first: False where the first measurement belongs to the time of the prior itself.
-            state: where to go on from (``history.final``); default the prior.
-            seed: of the random numbers; the same seed gives the same bits (in float64 for any number of threads).
+            state: where to go on from (``history.final``), with its own seed; default the prior.
+            seed: of the random numbers where no state brings its own; the same seed gives the same bits (in float64 for
+                any number of threads).
             record: "mean", "moments" (mean and covariance) or "beliefs" (everything that is carried).
             throw: raise on failed rows; False leaves it to ``history.diagnostics.ok``.
             progress: show a bar on a terminal.
@@ -149,12 +156,15 @@ class Filter(nn.Module, Generic[B]):
             FilterError: a row failed; the message names the first step, the rows and the measurement.
             TypeError, ValueError: dtype, shape, values that are not finite; the first bad entry is named.
         """
+        _check_tensor(measurements, "measurements")
         if measurements.dim() < 2 or len(measurements) == 0:
             raise ValueError(f"measurements must be (t, *batch, m) with t >= 1, got {tuple(measurements.shape)}")
         if state is None:
             state = self.init(tuple(measurements.shape[1:-1]), seed)
+        self._check_state(state)
         _check_measurements(measurements, state.belief, "measurements", measurements.shape[1:-1])
         if controls is not None:
+            _check_tensor(controls, "controls")
             if controls.dim() < 2 or len(controls) != len(measurements):
                 raise ValueError(
                     f"controls must be (t, k) or (t, *batch, k) with t = {len(measurements)}, "
@@ -179,6 +189,32 @@ class Filter(nn.Module, Generic[B]):
             first = int(failed.reshape(len(failed), -1).any(1).nonzero()[0])
             raise FilterError(_failure(history.diagnostics.ok[first], start + first, measurements[first]))
         return history
+
+    def _check_state(self, state: FilterState[B]) -> None:
+        """Raise a TypeError unless this is a state of this kind of filter."""
+        if not isinstance(state, FilterState):
+            raise TypeError(f"state must be a FilterState, as init() gives it, got {type(state).__name__}")
+        expected = getattr(self, "carries", None)
+        if expected is not None and not isinstance(state.belief, expected):
+            got = type(state.belief).__name__
+            raise TypeError(f"state must hold the {expected.__name__} of this filter, got {got}")
+
+
+def check_model(model: object) -> None:
+    """Raise a TypeError unless this is a model."""
+    if not isinstance(model, StateSpaceModel):
+        raise TypeError(f"model must be a StateSpaceModel, got {type(model).__name__}")
+
+
+def _check_tensor(value: object, name: str) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
+
+
+def _check_step_dtype(dt: Tensor, y: Tensor) -> None:
+    """Time steps of another precision would change that of the whole belief."""
+    if dt.is_floating_point() and dt.dtype != y.dtype:
+        raise TypeError(f"dt must have the model's dtype {y.dtype}, got {dt.dtype}")
 
 
 def _batch_of(belief: Gaussian | Particles) -> torch.Size:
@@ -227,6 +263,8 @@ def _check_step(dt: Step) -> None:
     """Finite and not negative."""
     if isinstance(dt, Tensor):
         _refuse(dt, ~(torch.isfinite(dt.detach()) & (dt.detach() >= 0)), "dt must be finite and >= 0")
+    elif dt is not None and not isinstance(dt, int | float):
+        raise TypeError(f"dt must be a number or a tensor, got {type(dt).__name__}")
     elif dt is not None and not 0 <= dt < float("inf"):
         raise ValueError(f"dt must be finite and >= 0, got {dt}")
 
@@ -244,11 +282,14 @@ def _time_steps(dt: Step, measurements: Tensor) -> list[Any]:
     if not isinstance(dt, Tensor):
         _check_step(dt)
         return [dt] * count
+    if dt.dim() == 0:
+        dt = dt.expand(count)
     if dt.shape not in ((count,), measurements.shape[:-1]):
         raise ValueError(f"dt must be a number, ({count},) or {tuple(measurements.shape[:-1])}, got {tuple(dt.shape)}")
     _check_step(dt)
     if dt.dim() == 1 and not dt.requires_grad:
         return list(dt.tolist())  # plain numbers let laws use what they hold for their usual step
+    _check_step_dtype(dt, measurements)
     return list(dt.unsqueeze(-1))
 
 

@@ -8,6 +8,7 @@ from torchfilt.moments import (
     Missing,
     Rule,
     Update,
+    check_rule_type,
     cubature,
     gauss_hermite,
     predict,
@@ -15,7 +16,7 @@ from torchfilt.moments import (
     unscented,
     update,
 )
-from torchfilt.run import Filter, Step
+from torchfilt.run import Filter, Step, check_model
 from torchfilt.types import FilterState, StepInfo, StepNoise
 
 
@@ -32,11 +33,14 @@ class GaussianFilter(Filter[Gaussian]):
         iterations: linearisations of the measurement law, each about the posterior of the one before.
 
     Raises:
-        ValueError: iterations below 1.
+        ValueError: iterations below 1. TypeError: not a model, not a moment rule.
     """
+
+    carries = Gaussian
 
     def __init__(self, model: StateSpaceModel, rule: Rule, iterations: int = 1) -> None:
         super().__init__(model)
+        check_rule_type(rule)
         if iterations < 1:
             raise ValueError(f"iterations must be at least 1, got {iterations}")
         self.rule, self.iterations = rule, iterations
@@ -91,6 +95,7 @@ def KalmanFilter(model: StateSpaceModel) -> GaussianFilter:
 
     Source: Kailath, Sayed, Hassibi, Linear Estimation (2000), chapter 12.
     """
+    check_model(model)
     for name in ("transition", "observation"):
         law = getattr(model, name)
         if not hasattr(law, "linear_form"):

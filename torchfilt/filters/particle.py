@@ -45,9 +45,13 @@ class ParticleFilter(Filter[Particles]):
     Raises:
         ValueError: fewer than two particles (pooled redraw: than e + 2), a move on particles with covariances.
 
+        TypeError: not a model, not a resampler.
+
     Source: Scibior and Wood, Differentiable particle filtering without modifying the forward pass (2021), for the
         gradients.
     """
+
+    carries = Particles
 
     def __init__(
         self,
@@ -59,6 +63,8 @@ class ParticleFilter(Filter[Particles]):
         fast_normals: bool = False,
     ) -> None:
         super().__init__(model)
+        if not isinstance(resampler, Resampler):
+            raise TypeError(f"resampler must be a Resampler, such as systematic or ess_below(0.5), got {resampler!r}")
         if particles < 2:
             raise ValueError(f"particles must be at least 2, got {particles}")
         size = self.tangent_size = _tangent_size(model.initial())
