@@ -98,7 +98,7 @@ def run_command(program: str, options: dict[str, Any], run: Callable[[dict[str, 
     debug, stop = options["debug"], Signals()
     try:
         with stop:
-            run(options)
+            run(dict(options))  # a copy: what it takes out is still needed here
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second during a fit
         if not stop.received:
             raise

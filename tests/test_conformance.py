@@ -385,7 +385,7 @@ class Leaky(nn.Module):
         if self.defect == "infinite":
             mean = mean / 0
         if self.defect == "raises on NaN":
-            return torch.distributions.Normal(mean, 1.0)
+            return torch.distributions.Normal(mean, 1.0, validate_args=True)
         if self.defect == "not a law":
             return mean
         if self.defect == "drops a dim":

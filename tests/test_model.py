@@ -335,3 +335,41 @@ def test_the_caller_may_change_his_tensors():
     model = tf.StateSpaceModel(PRIOR._replace(mean=mean), WALK, WALK)
     mean += 1
     assert torch.equal(model.prior().mean, PRIOR.mean)
+
+
+@pytest.mark.parametrize(
+    ("prior", "transition", "observation", "error", "message"),
+    [
+        (3, (2, 2), (1, 2), ValueError, r"transition's matrix \(..., 2, 2\) does not fit a state of 3 numbers"),
+        (2, (3, 2), (1, 2), ValueError, r"transition's matrix \(..., 3, 2\) does not fit a state of 2 numbers"),
+        (2, (2, 2), (1, 3), ValueError, r"observation's matrix \(..., 1, 3\) does not fit a state of 2 numbers"),
+    ],
+)
+def test_linear_laws_must_fit_the_prior(prior, transition, observation, error, message):
+    def law(rows, columns):
+        return tf.LinearGaussian(torch.ones(rows, columns, dtype=torch.float64), torch.eye(rows, dtype=torch.float64))
+
+    initial = tf.Gaussian(torch.zeros(prior, dtype=torch.float64), torch.eye(prior, dtype=torch.float64))
+    with pytest.raises(error, match=message):
+        tf.StateSpaceModel(initial, law(*transition), law(*observation))
+
+
+def test_precisions_of_prior_and_laws_must_agree():
+    initial = tf.Gaussian(torch.zeros(2), torch.eye(2))
+    law = tf.LinearGaussian(torch.eye(2, dtype=torch.float64), torch.eye(2, dtype=torch.float64))
+    with pytest.raises(TypeError, match=r"transition.s matrix is torch\.float64, the initial mean torch\.float32"):
+        tf.StateSpaceModel(initial, law, law)
+    with pytest.raises(TypeError, match=r"initial mean must be floating point, got torch\.int64"):
+        tf.StateSpaceModel(tf.Gaussian(torch.zeros(2, dtype=torch.int64), torch.eye(2)), law, law)
+
+
+def test_controls_that_no_law_takes_are_refused():
+    one = torch.eye(1, dtype=torch.float64)
+    law = tf.AdditiveGaussian(lambda x: x, one)
+    model = tf.StateSpaceModel(tf.Gaussian(torch.zeros(1, dtype=torch.float64), one), lambda x: law(x), law)
+    tracker = tf.UnscentedKalmanFilter(model)
+    y = torch.zeros(3, 1, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"controls \(3, 1\) were given, but the transition law has no argument u"):
+        tracker(y, y)
+    with pytest.raises(ValueError, match=r"u \(1,\) were given, but the transition law has no argument u"):
+        tracker.step(tracker.init(), y[0], y[0])

@@ -509,3 +509,11 @@ def test_derivatives_are_noticed_in_both_modes():
     torch.func.vjp(look, x)
     torch.vmap(look)(x)
     assert seen == [False, True, False, True, True, False]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_norm_of_a_measured_quaternion_does_not_count(side: str) -> None:
+    space = UnitQuaternion(side)
+    x = space.project(torch.tensor([0.1, -0.2, 0.3, 0.9], dtype=torch.float64))
+    y = space.project(torch.tensor([0.3, 0.2, -0.1, 0.8], dtype=torch.float64))
+    torch.testing.assert_close(space.local(x, 1.7 * y), space.local(x, y), rtol=1e-14, atol=1e-15)

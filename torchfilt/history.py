@@ -60,7 +60,7 @@ class History:
         arrays = {"mean": self.mean}
         if self.beliefs is not None or self.cloud_covariance is not None:
             arrays["covariance"] = self.covariance
-        arrays |= {name: value for name, value in self.diagnostics._asdict().items() if value is not None}
+        arrays |= {name: value for name, value in self.diagnostics._asdict().items() if isinstance(value, Tensor)}
         return {name: value.detach().cpu().numpy() for name, value in arrays.items()}
 
     def to_xarray(self) -> Any:
@@ -97,7 +97,8 @@ class History:
             "is_diagonal": bool(getattr(final, "is_diagonal", False)),
         }
         parts: dict[str, Tensor | None] = {"mean": self.mean, "covariance": self.cloud_covariance}
-        parts |= {f"info.{name}": value for name, value in self.diagnostics._asdict().items()}
+        report = self.diagnostics._asdict()
+        parts |= {f"info.{name}": value for name, value in report.items() if isinstance(value, Tensor)}
         for prefix, belief in (("final", final), ("beliefs", self.beliefs)):
             if belief is not None:
                 named = belief._asdict()
@@ -130,7 +131,8 @@ class History:
             final = _belief(tensors, "final", head, space)
             recorded = {name for name in tensors if name.startswith("beliefs.")}
             beliefs = _belief(tensors, "beliefs", head, space) if recorded else None
-            optional = {name: tensors.get(f"info.{name}") for name in StepInfo._fields[2:]}
+            optional: dict[str, Any] = {name: tensors.get(f"info.{name}") for name in StepInfo._fields[2:]}
+            optional["evidence"] = str(head["evidence"])
             info = StepInfo(tensors["info.log_likelihood"], tensors["info.ok"], **optional)
             return cls(
                 tensors["mean"],

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import call_style, check_factor, check_finite, takes_in_order
+from torchfilt.laws import LinearGaussian, call_style, check_factor, check_finite, takes_in_order
 from torchfilt.linalg import psd_factor
 from torchfilt.moments import Missing
 
@@ -32,7 +32,8 @@ class StateSpaceModel(nn.Module):
         observation: law called as ``observation(x)``.
 
     Raises:
-        TypeError: initial is none of these, a law is not callable.
+        TypeError: initial is none of these, a law is not callable, linear laws of another dtype.
+        ValueError: linear laws of another size than the initial mean.
     """
 
     def __init__(
@@ -52,6 +53,28 @@ class StateSpaceModel(nn.Module):
         self._styles = {name: call_style(law) for name, law in laws.items()}
         self._short_cuts = {name: _short_cuts(law) for name, law in laws.items()}
         self._direct = {name: bool(self._short_cuts[name]) and takes_in_order(law) for name, law in laws.items()}
+        self._check_linear_laws()
+
+    def _check_linear_laws(self) -> None:
+        """Linear laws show their sizes before anything runs."""
+        if not isinstance(self.initial, InitialLaw) or self.initial.is_distribution:
+            return
+        mean = self.initial.mean
+        for name in ("transition", "observation"):
+            law = getattr(self, name)
+            if not isinstance(law, LinearGaussian):
+                continue
+            if law.matrix.dtype != mean.dtype:
+                raise TypeError(f"the {name}'s matrix is {law.matrix.dtype}, the initial mean {mean.dtype}")
+            rows, columns = law.matrix.shape[-2:]
+            if columns != mean.shape[-1] or (name == "transition" and rows != columns):
+                raise ValueError(
+                    f"the {name}'s matrix (..., {rows}, {columns}) does not fit a state of {mean.shape[-1]} numbers"
+                )
+
+    def takes_controls(self) -> bool:
+        """Whether the transition has a place for a control u."""
+        return self._styles["transition"].takes_u
 
     def conditional(
         self, name: str, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None
@@ -112,6 +135,8 @@ class InitialLaw(nn.Module):
         if law.mean.dim() == 0 or law.space.size not in (None, law.mean.shape[-1]):
             size = "d" if law.space.size is None else law.space.size
             raise ValueError(f"initial mean must be (*batch, {size}) on {law.space!r}, got {tuple(law.mean.shape)}")
+        if not law.mean.is_floating_point():
+            raise TypeError(f"initial mean must be floating point, got {law.mean.dtype}")
         check_finite(law.mean, "initial mean")
         check_finite(law.scale_tril, "initial scale_tril")
         expected = law.space.tangent_size if law.space.tangent_size is not None else law.mean.shape[-1]
@@ -127,6 +152,11 @@ class InitialLaw(nn.Module):
             else:
                 self.register_buffer(name, tensor.clone())
         self.space, self.is_diagonal = law.space, law.is_diagonal
+
+    @property
+    def is_distribution(self) -> bool:
+        """Whether the law is a torch Distribution."""
+        return self._distribution is not None
 
     def forward(self) -> Conditional:
         """The law."""

@@ -90,7 +90,7 @@ class Recorder:
         else:
             self._add_cloud(belief)
         for name, value in zip(info._fields, info, strict=True):
-            if value is not None and self._wanted(name):
+            if isinstance(value, Tensor) and self._wanted(name):
                 self._put(f"info.{name}", value)
 
     def _add_cloud(self, belief: Particles) -> None:
@@ -121,7 +121,8 @@ class Recorder:
         """The history of all steps taken in."""
         found = {name: series.stacked() for name, series in self.series.items() if self._whole(series)}
         mean, space = found["mean"], final.belief.space
-        info = StepInfo(**{name: found.get(f"info.{name}") for name in StepInfo._fields})  # type: ignore[arg-type]
+        report: dict[str, Any] = {name: found.get(f"info.{name}") for name in StepInfo._fields}
+        info = StepInfo(**{**report, "evidence": self.evidence})
         beliefs: Gaussian | Particles | None = None
         if isinstance(final.belief, Gaussian) and "scale_tril" in found:
             factor = found["scale_tril"]

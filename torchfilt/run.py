@@ -108,6 +108,7 @@ class Filter(nn.Module, Generic[B]):
         _check_measurements(y, state.belief, "y", y.shape[:-1])
         if u is not None:
             _check_tensor(u, "u")
+            self._check_taken(u, "u")
             _check_controls(u, y, "u", u.shape[:-1], batch)
         _check_step(dt)
         if isinstance(dt, Tensor):
@@ -121,6 +122,11 @@ class Filter(nn.Module, Generic[B]):
         if throw and not bool(info.ok.all()):
             raise FilterError(_failure(info.ok, state.step, y))
         return FilterState(belief, state.step + 1, state.seed), info
+
+    def _check_taken(self, u: Tensor, name: str) -> None:
+        """A control that no law would look at is a mistake."""
+        if not self.model.takes_controls():
+            raise ValueError(f"{name} {tuple(u.shape)} were given, but the transition law has no argument u")
 
     def forward(
         self,
@@ -170,6 +176,7 @@ class Filter(nn.Module, Generic[B]):
                     f"controls must be (t, k) or (t, *batch, k) with t = {len(measurements)}, "
                     f"got {tuple(controls.shape)}"
                 )
+            self._check_taken(controls, "controls")
             _check_controls(controls, measurements, "controls", controls.shape[1:-1], measurements.shape[1:-1])
         steps = _time_steps(dt, measurements)
         missing = _missing_by_step(measurements)

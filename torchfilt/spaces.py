@@ -190,12 +190,13 @@ class UnitQuaternion:
         return self.project(turned)
 
     def local(self, x: Tensor, y: Tensor) -> Tensor:
-        """Rotation vector (at most pi long) that turns x into y."""
+        """Rotation vector (at most pi long) that turns x into y; a norm that is not one does not count."""
         roma = _roma()
         x, y = torch.broadcast_tensors(x, y)
         inverse = roma.quat_conjugation(x)
         turn = roma.quat_product(inverse, y) if self.side == "right" else roma.quat_product(y, inverse)
-        return roma.unitquat_to_rotvec(turn)
+        rotation: Tensor = roma.unitquat_to_rotvec(self.project(turn))
+        return rotation
 
     def project(self, x: Tensor) -> Tensor:
         """Normalised quaternion."""

@@ -23,6 +23,7 @@ class StepInfo(NamedTuple):
 
     log_likelihood, ok, nis, ess, acceptance_rate: (*batch). innovation (*batch, e_y) and its factor
     (*batch, e_y, e_y), or (e_y, e_y) where all rows share it; ancestors (*batch, n). A history stacks them along time.
+    evidence says what log_likelihood is, see `torchfilt.run.Filter`: "approximate" where the form biases it.
     """
 
     log_likelihood: Tensor
@@ -33,6 +34,7 @@ class StepInfo(NamedTuple):
     ess: Tensor | None = None
     ancestors: Tensor | None = None
     acceptance_rate: Tensor | None = None
+    evidence: str | None = None
 
 
 class StepNoise(NamedTuple):

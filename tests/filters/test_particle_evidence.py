@@ -287,3 +287,15 @@ def test_literal_start_alone_counts_the_prior_twice():
     assert filter.evidence == "approximate"
     score, _, _ = bias_score(history.log_likelihood, exact.log_likelihood.sum())
     assert abs(score) > 10
+
+
+def test_the_report_of_a_step_says_what_its_likelihood_is():
+    ys, _ = series(2)
+    for make, label in (
+        (tf.KalmanFilter, "exact"),
+        (tf.BootstrapFilter, "unbiased"),
+        (tf.UnscentedParticleFilter, "approximate"),
+    ):
+        filter = make(state_space(PLANE))
+        _, info = filter.step(filter.init(), ys[0])
+        assert info.evidence == filter(ys).diagnostics.evidence == label

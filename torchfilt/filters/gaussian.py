@@ -83,7 +83,14 @@ class GaussianFilter(Filter[Gaussian]):
         # NaN and infinity survive a sum, and only what is neither leaves nothing when it is taken from itself.
         probe = result.log_likelihood + posterior.mean.sum(-1) + posterior.scale_tril.sum((-2, -1))
         ok = probe - probe == 0
-        info = StepInfo(result.log_likelihood, ok, result.innovation, result.innovation_scale_tril, result.nis)
+        info = StepInfo(
+            result.log_likelihood,
+            ok,
+            result.innovation,
+            result.innovation_scale_tril,
+            result.nis,
+            evidence=self.evidence,
+        )
         return posterior, info
 
 

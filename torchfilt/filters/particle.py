@@ -157,7 +157,9 @@ class ParticleFilter(Filter[Particles]):
         if self.move is not None and predict:
             x, rate = self.move(self.model, belief, after, y, u, dt, noise, missing)
             after = after._replace(x=x)
-        info = StepInfo(log_likelihood, ok, ess=after.ess, ancestors=ancestors, acceptance_rate=rate)
+        info = StepInfo(
+            log_likelihood, ok, ess=after.ess, ancestors=ancestors, acceptance_rate=rate, evidence=self.evidence
+        )
         return after, info
 
     def _resample(self, belief: Particles, uniforms: Tensor) -> tuple[Particles, Tensor, Tensor | None]:
