@@ -2,17 +2,13 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from particle_problem import PLANE, state_space, tensor
 from scipy import stats
 from scipy.spatial.distance import mahalanobis
-
-sys.path.insert(0, str(Path(__file__).parent / "filters"))
-
-from particle_problem import PLANE, state_space, tensor
 
 import torchfilt as tf
 from torchfilt import metrics

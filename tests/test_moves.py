@@ -1,16 +1,10 @@
 """Metropolis-Hastings: the target is left as it is, and what cannot be reached is refused."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from scipy import stats
-
-sys.path.insert(0, str(Path(__file__).parent / "filters"))
-
 from particle_problem import PLANE, gaussian, replicate, series, state_space, tensor
+from scipy import stats
 
 import torchfilt as tf
 from torchfilt.moves import MetropolisHastings

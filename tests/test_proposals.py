@@ -1,14 +1,8 @@
 """Local proposals: one mechanism, its policies, and what each leaves unchanged."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parent / "filters"))
-
 from particle_problem import PLANE, gaussian, series, state_space, tensor
 
 import torchfilt as tf

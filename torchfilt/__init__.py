@@ -1,8 +1,5 @@
 """Probabilistic filtering in PyTorch: one state-space model, any filter, gradients through everything."""
 
-from importlib import import_module
-from typing import Any
-
 from torchfilt import moments, moves, proposals, resampling, spaces
 from torchfilt.filters import (
     BootstrapFilter,
@@ -19,6 +16,7 @@ from torchfilt.filters import (
 from torchfilt.gaussian import Gaussian
 from torchfilt.history import History
 from torchfilt.laws import AdditiveGaussian, LinearGaussian
+from torchfilt.lazy import lazy_names
 from torchfilt.model import StateSpaceModel
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
@@ -28,8 +26,9 @@ from torchfilt.types import FilterError, FilterState, StepInfo, StepNoise
 __version__ = "0.1.0"
 
 # Loaded when first named: they bring GPyTorch, Lightning, SciPy or a plotting library.
-_LATER = {"GPTransition": "gp"}
-_MODULES = ("gp", "io", "learning", "metrics", "models", "testing")
+_LATER = {"GPTransition": "gp"} | dict.fromkeys(
+    ("gp", "io", "learning", "metrics", "missions", "models", "testing"), ""
+)
 
 __all__ = [
     "AdditiveGaussian",
@@ -62,6 +61,7 @@ __all__ = [
     "io",
     "learning",
     "metrics",
+    "missions",
     "models",
     "moments",
     "moves",
@@ -71,14 +71,4 @@ __all__ = [
     "testing",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _LATER:
-        return getattr(import_module(f"{__name__}.{_LATER[name]}"), name)
-    if name in _MODULES:
-        return import_module(f"{__name__}.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LATER, *_MODULES})
+__getattr__, __dir__ = lazy_names(__name__, _LATER, globals())

@@ -1,12 +1,8 @@
 """What a filter did over a whole series."""
 
-import io
-import json
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import torch
 from torch import Tensor
@@ -14,7 +10,7 @@ from torch import Tensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.particles import Particles
 from torchfilt.spaces import EUCLIDEAN, Angle, Euclidean, Product, Space, UnitQuaternion
-from torchfilt.storage import IntegrityError, read_verified, write_verified
+from torchfilt.storage import NOT_OURS, IntegrityError, read_arrays, write_arrays
 from torchfilt.types import FilterState, StepInfo
 
 FILE_KIND = "torchfilt history"
@@ -84,8 +80,6 @@ class History:
 
     def save(self, path: str | Path) -> None:
         """Write an NPZ (no pickle) with its SHA-256 manifest, atomically; the final state is in it."""
-        import numpy as np
-
         final = self.final.belief
         kind = "gaussian" if isinstance(final, Gaussian) else "particles"
         head = {
@@ -105,11 +99,7 @@ class History:
                 parts |= {f"{prefix}.{name}": named[name] for name in named if isinstance(named[name], Tensor)}
         if isinstance(final, Particles):  # made on another way than from log_weights they differ in the last bit
             parts["final.weights"] = final.weights
-        arrays: dict[str, Any] = {n: value.detach().cpu().numpy() for n, value in parts.items() if value is not None}
-        arrays["head"] = np.frombuffer(json.dumps(head, sort_keys=True).encode(), dtype=np.uint8)
-        stream = io.BytesIO()
-        np.savez(stream, **arrays)
-        write_verified(path, stream.getvalue(), FILE_KIND)
+        write_arrays(path, {name: value for name, value in parts.items() if value is not None}, head, FILE_KIND)
 
     @classmethod
     def load(cls, path: str | Path) -> "History":
@@ -119,13 +109,8 @@ class History:
             FileNotFoundError: no such file.
             IntegrityError: truncated, altered or foreign; names the file and the rule.
         """
-        import numpy as np
-
-        data = read_verified(path, FILE_KIND)
+        arrays, head = read_arrays(path, FILE_KIND)
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            head = json.loads(arrays.pop("head").tobytes())
             tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
             space = space_from_plain(head["space"])
             final = _belief(tensors, "final", head, space)
@@ -143,22 +128,8 @@ class History:
                 beliefs,
                 tensors.get("covariance"),
             )
-        except _NOT_A_HISTORY as error:
+        except NOT_OURS as error:
             raise IntegrityError(f"{path}: not a history of this version ({error})") from None
-
-
-# What archives, arrays and heads that are not ours make the readers raise.
-_NOT_A_HISTORY = (
-    KeyError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    OSError,
-    EOFError,
-    RuntimeError,
-    BadZipFile,
-    zlib.error,
-)
 
 
 _SPACES = {"Euclidean": Euclidean, "Angle": Angle, "UnitQuaternion": UnitQuaternion}

@@ -1,7 +1,7 @@
 """How particles reach the next step: from the motion alone, or each by its own Gaussian filter."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -27,6 +27,48 @@ class Proposed(NamedTuple):
     scale_tril: Tensor | None
     log_weight: Tensor
     space: Space
+
+
+class Proposal(Protocol):
+    """How particles reach the next step; `Prior` and `Local` ship.
+
+    evidence: what the log-likelihood is worth. draws_at_once: the call draws. needs_redraw_noise: `refresh` draws.
+    leaves_points: particles carry no covariance after a step.
+    """
+
+    @property
+    def evidence(self) -> Evidence: ...
+
+    @property
+    def draws_at_once(self) -> bool: ...
+
+    @property
+    def needs_redraw_noise(self) -> bool: ...
+
+    @property
+    def leaves_points(self) -> bool: ...
+
+    def start(self, initial: Conditional, draws: Tensor, noise: Tensor) -> Particles:
+        """Particles for draws (*batch, n, d) of the initial law."""
+        ...
+
+    def refresh(self, particles: Particles, noise: Tensor | None, resampled: Tensor | None) -> Particles:
+        """Share uncertainty anew between particles and their covariances, after resampling."""
+        ...
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        particles: Particles,
+        y: Tensor,
+        u: Tensor | None,
+        dt: Step,
+        noise: StepNoise,
+        missing: Missing,
+        move: bool,
+    ) -> Proposed:
+        """Move, measure and weight; shapes as in `Local`."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,9 @@
 """Fixtures of this folder; the oracles lie beside it."""
 
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from gp_problem import outputs, queries
 
 from torchfilt.gp.regression import GPRegression

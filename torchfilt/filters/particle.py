@@ -14,7 +14,7 @@ from torchfilt.moments import Missing, Rule, unscented
 from torchfilt.moves import MetropolisHastings
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
-from torchfilt.proposals import Local, Prior, Proposed, Redraw, Weights
+from torchfilt.proposals import Local, Prior, Proposal, Proposed, Redraw, Weights
 from torchfilt.resampling import Resampler, by_component, ess_below, gather_particles, systematic
 from torchfilt.run import Filter, Step
 from torchfilt.types import FilterState, StepInfo, StepNoise
@@ -37,7 +37,7 @@ class ParticleFilter(Filter[Particles]):
     Args:
         model: the three laws.
         particles: n.
-        proposal: `Prior` or `Local`.
+        proposal: `Prior`, `Local` or anything that is a `Proposal`.
         resampler: scheme and policy, such as ``ess_below(0.5)`` or ``systematic`` (always).
         move: `MetropolisHastings`, for proposals that leave points; or None.
         fast_normals: draw float64 normals as float32 and cast them: 3.7 times cheaper, 24 bits fine.
@@ -57,7 +57,7 @@ class ParticleFilter(Filter[Particles]):
         self,
         model: StateSpaceModel,
         particles: int,
-        proposal: Prior | Local,
+        proposal: Proposal,
         resampler: Resampler = systematic,
         move: MetropolisHastings | None = None,
         fast_normals: bool = False,

@@ -11,8 +11,6 @@ Two forms, one interface:
   weights; variance by a triangular solve.
 """
 
-import io
-import json
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -21,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchfilt.gp.fourier import harmonics
-from torchfilt.storage import IntegrityError, read_verified, write_verified
+from torchfilt.storage import NOT_OURS, IntegrityError, read_arrays, write_arrays
 
 Kind = Literal["structured", "dense"]
 FILE_KIND = "torchfilt frozen Gaussian process"
@@ -299,14 +297,8 @@ class FrozenGP(nn.Module):
 
     def save(self, path: str | Path) -> None:
         """Write an NPZ (no pickle) and its SHA-256 manifest, atomically."""
-        import numpy as np
-
         head = {"kind": self.kind, "state_size": self.state_size, "settings": self.settings}
-        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in self.state_dict().items()}
-        arrays["head"] = np.frombuffer(json.dumps(head, sort_keys=True).encode(), dtype=np.uint8)
-        stream = io.BytesIO()
-        np.savez(stream, **arrays)
-        write_verified(path, stream.getvalue(), FILE_KIND)
+        write_arrays(path, self.state_dict(), head, FILE_KIND)
 
     @classmethod
     def load(cls, path: str | Path) -> "FrozenGP":
@@ -316,16 +308,11 @@ class FrozenGP(nn.Module):
             FileNotFoundError: no such file.
             IntegrityError: truncated, altered or foreign; names the file and the rule.
         """
-        import numpy as np
-
-        data = read_verified(path, FILE_KIND)
+        arrays, head = read_arrays(path, FILE_KIND)
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            head = json.loads(arrays.pop("head").tobytes())
             tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
             noise = tensors.pop("noise")
             inner = {name.removeprefix("posterior."): tensor for name, tensor in tensors.items()}
             return cls(head["kind"], inner, noise, head["state_size"], head["settings"])
-        except (KeyError, ValueError, TypeError, OSError) as error:
+        except NOT_OURS as error:
             raise IntegrityError(f"{path}: not a frozen Gaussian process of this version ({error})") from None

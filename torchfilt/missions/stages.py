@@ -1,7 +1,6 @@
 """Results of long computations kept in a run folder, so that an interrupted run goes on where it stood."""
 
 import hashlib
-import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchfilt.storage import IntegrityError, manifest_path, read_verified, write_verified
+from torchfilt.storage import IntegrityError, manifest_path, read_arrays, write_arrays
 
 Arrays = dict[str, np.ndarray]
 FILE_KIND = "torchfilt stage"
@@ -45,14 +44,12 @@ class Stages:
         path = self.path(name, recipe)
         if path is not None and path.is_file():
             try:
-                return _read(path)
+                return read_arrays(path, FILE_KIND)[0]
             except IntegrityError as error:
                 self.say(f"{error}; computed again")
         arrays = compute()
         if path is not None:
-            stream = io.BytesIO()
-            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-            write_verified(path, stream.getvalue(), FILE_KIND)
+            write_arrays(path, arrays, recipe, FILE_KIND)
         return arrays
 
     def clear(self) -> None:
@@ -62,12 +59,3 @@ class Stages:
         for path in self.folder.glob("*.npz"):
             manifest_path(path).unlink(missing_ok=True)
             path.unlink()
-
-
-def _read(path: Path) -> Arrays:
-    data = read_verified(path, FILE_KIND)
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, KeyError) as error:
-        raise IntegrityError(f"{path}: not a stage of this version ({error})") from None

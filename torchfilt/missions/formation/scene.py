@@ -292,7 +292,7 @@ def make_filter(name: str, scene: Scene, settings: StudySettings, gp: FrozenGP |
     if name.startswith("cw-pf"):
         return BootstrapFilter(model, settings.bootstrap_particles)
     if name == "mf-upf-literal":
-        return ParticleFilter(model, settings.particles, literal_proposal(), ess_below(0.5))  # type: ignore[arg-type]
+        return ParticleFilter(model, settings.particles, literal_proposal(), ess_below(0.5))
     return UnscentedParticleFilter(model, settings.particles)
 
 

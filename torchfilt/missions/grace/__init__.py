@@ -3,8 +3,7 @@
 Names load what they need when first used.
 """
 
-from importlib import import_module
-from typing import Any
+from torchfilt.lazy import lazy_names
 
 _HOMES = {
     "GraceData": "data",
@@ -32,12 +31,4 @@ _HOMES = {
 
 __all__ = sorted(_HOMES)
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOMES])
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, globals())
