@@ -155,3 +155,30 @@ def test_fast_normals_are_those_of_float32():
     assert fast.dtype == torch.float64
     assert torch.equal(fast, single.double())
     assert not torch.equal(fast, NoiseSource(4).normal((30, 2), 1, 1, LIKE))
+
+
+def test_large_draws_are_normal_across_blocks_and_pairs():
+    """Made by pairs, block by block: each false alarm of the tests below is one in a million."""
+    count = 200_001  # odd, and four blocks
+    draws = NoiseSource(8).normal((count,), 0, 0, LIKE)
+    assert stats.kstest(draws, "norm").pvalue > 1e-6
+    assert len(torch.unique(draws)) == count
+    half = (count + 1) // 2
+    first, second = draws[: count - half], draws[half:]  # cosines and sines of the same angles
+    for power in (1, 2, 4):
+        z = np.corrcoef(first**power, second**power)[0, 1] * np.sqrt(count - half)
+        assert abs(z) < 4.9
+    # The angle of a pair is uniform and tells nothing of its length.
+    angle, length = torch.atan2(second, first), torch.hypot(first, second)
+    assert stats.kstest((angle / (2 * np.pi) + 0.5), "uniform").pvalue > 1e-6
+    assert abs(stats.spearmanr(angle, length).statistic) * np.sqrt(count - half) < 4.9
+
+
+def test_no_uniform_makes_an_infinite_normal(monkeypatch):
+    """The generator may give zero, and the largest number below one."""
+    for value in (0.0, 1 - 2**-53):
+        monkeypatch.setattr(
+            torch, "rand", lambda shape, value=value, **_: torch.full(shape, value, dtype=torch.float64)
+        )
+        draws = NoiseSource(0).normal((5000,), 0, 0, LIKE)
+        assert torch.isfinite(draws).all() and draws.abs().max() < 8.6
