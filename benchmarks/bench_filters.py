@@ -15,18 +15,18 @@ ns a particle and step (ratio to the bare in-place loop of the same precision, o
 
                                           n = 1e3     n = 1e4     n = 1e5
 -------------------------------------  ----------  ----------  ----------
-f32 torchfilt                          196 (3.18)   47 (1.72)   34 (1.37)
-f32 torchfilt, covariance too          202 (3.29)   54 (1.98)   43 (1.75)
-f32 bare torch, in place                62 (1.00)   27 (1.00)   25 (1.00)
-f32 bare torch, naive                  150 (2.43)  105 (3.87)  104 (4.20)
-f64 torchfilt, fast normals            196 (2.54)   66 (1.48)   68 (1.45)
-f64 bare torch, in place, f32 normals   77 (1.00)   45 (1.00)   47 (1.00)
-f64 torchfilt                          268 (1.80)  144 (1.25)  144 (1.21)
-f64 torchfilt, covariance too          302 (2.03)  163 (1.42)  160 (1.35)
-f64 bare torch, in place               149 (1.00)  115 (1.00)  119 (1.00)
-f64 bare torch, naive                  230 (1.55)  187 (1.63)  189 (1.59)
-f64 filterpy resampler + NumPy         307 (2.06)  290 (2.52)  287 (2.41)
-f64 particles                          221 (1.49)  141 (1.23)  155 (1.30)
+f32 torchfilt                          173 (2.94)   44 (1.66)   33 (1.40)
+f32 torchfilt, covariance too          193 (3.30)   51 (1.94)   43 (1.83)
+f32 bare torch, in place                59 (1.00)   26 (1.00)   23 (1.00)
+f32 bare torch, naive                  143 (2.44)  101 (3.82)   99 (4.25)
+f64 torchfilt, fast normals            188 (2.53)   63 (1.55)   64 (1.51)
+f64 bare torch, in place, f32 normals   74 (1.00)   41 (1.00)   42 (1.00)
+f64 torchfilt                          251 (1.77)   92 (0.84)   92 (0.84)
+f64 torchfilt, covariance too          287 (2.02)  118 (1.07)  112 (1.03)
+f64 bare torch, in place               142 (1.00)  110 (1.00)  109 (1.00)
+f64 bare torch, naive                  224 (1.58)  176 (1.60)  183 (1.68)
+f64 filterpy resampler + NumPy         297 (2.09)  282 (2.56)  273 (2.50)
+f64 particles                          215 (1.51)  132 (1.20)  147 (1.34)
 
 ATen calls a step: torchfilt 59 (19 of them views), bare in place 33 (7).
 
@@ -35,14 +35,14 @@ ns a series and step (ratio to torchfilt with a covariance a row):
 
                                             1 series       100 series    10,000 series
 -----------------------------------  ---------------  ---------------  ---------------
-torchfilt                            130,508 (0.872)    1,399 (0.440)       38 (0.018)
-torchfilt, covariance too            132,584 (0.886)    1,400 (0.441)       39 (0.019)
-torchfilt f32                        130,798 (0.874)    1,386 (0.436)       28 (0.013)
-torchfilt, a covariance a row        149,611 (1.000)    3,179 (1.000)    2,068 (1.000)
-torch, the obvious batch              55,457 (0.371)    1,756 (0.552)    1,186 (0.573)
-torch-kf*                             48,768 (0.326)    1,361 (0.428)      892 (0.431)
-filterpy                              57,442 (0.384)  56,650 (17.820)  57,068 (27.598)
-torchfilt, a tenth missing anywhere  152,498 (1.019)    4,092 (1.287)    1,878 (0.908)
+torchfilt                            130,881 (0.867)    1,385 (0.442)       41 (0.025)
+torchfilt, covariance too            132,484 (0.878)    1,396 (0.445)       39 (0.024)
+torchfilt f32                        131,487 (0.871)    1,382 (0.441)       27 (0.017)
+torchfilt, a covariance a row        150,950 (1.000)    3,137 (1.000)    1,629 (1.000)
+torch, the obvious batch              55,627 (0.369)    1,754 (0.559)    1,169 (0.717)
+torch-kf*                             48,823 (0.323)    1,344 (0.429)      873 (0.536)
+filterpy                              58,081 (0.385)  55,832 (17.801)  55,819 (34.264)
+torchfilt, a tenth missing anywhere  154,439 (1.023)    4,100 (1.307)    1,899 (1.166)
 
 * no log-likelihood. filterpy ran over at most 3 series, scaled.
 
@@ -51,18 +51,18 @@ ns a series and step (ratio to filterpy, which ran over at most 3 series, scaled
 
                       1 series       100 series    10,000 series
 -------------  ---------------  ---------------  ---------------
-filterpy       358,702 (1.000)  363,501 (1.000)  397,247 (1.000)
-torchfilt      525,230 (1.464)    8,020 (0.022)    2,742 (0.007)
-torchfilt f32  490,309 (1.367)    7,236 (0.020)    2,241 (0.006)
+filterpy       330,683 (1.000)  338,905 (1.000)  350,169 (1.000)
+torchfilt      484,329 (1.465)    7,858 (0.023)    2,712 (0.008)
+torchfilt f32  460,091 (1.391)    7,138 (0.021)    2,136 (0.006)
 
 Unscented particle filter, 6 states, one series: ns a particle and step.
 
                   ns
 -------------  -----
-f64, n = 200   6,988
-f32, n = 200   6,781
-f64, n = 1000  4,890
-f32, n = 1000  4,564
+f64, n = 200   7,462
+f32, n = 200   7,007
+f64, n = 1000  4,997
+f32, n = 1000  4,580
 -- end of the last result --
 """
 
