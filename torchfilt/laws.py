@@ -7,7 +7,7 @@ broadcastable: u is (*lead, k) and dt is a number or (*lead, 1) where lead broad
 
 import inspect
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -23,14 +23,6 @@ class LinearForm(NamedTuple):
     matrix: Tensor
     offset: Tensor | None
     scale_tril: Tensor
-
-
-class HasLinearForm(Protocol):
-    """A law that is linear in the state gives its matrices; exact filters and the shared-covariance path use them."""
-
-    def linear_form(self, u: Tensor | None = None, dt: Tensor | float | None = None) -> LinearForm:
-        """Matrices for this control and time step."""
-        ...
 
 
 class _Factor(nn.Module):

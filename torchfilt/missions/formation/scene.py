@@ -77,7 +77,7 @@ class StudySettings:
         steps: measurements, 10 s apart; 1166 are two revolutions.
         gp_psd_m2_s3: acceleration noise beside the GP's own variance. The one-step errors of the GP (6e-10 m/s) repeat
             over a quarter of a revolution, which as white noise is (6e-10)^2 * 150 / 10 s = 5e-18; twenty times that
-            leaves room. With 1e-15 the GP-UKF's NEES on the second revolution is 3.9 instead of 4.6 (40 runs).
+            leaves room. With 1e-15 the GP-UKF's NEES on the second revolution is 3.7 instead of 4.3 (40 runs).
         cw_psd_m2_s3: acceleration noise tuned for Clohessy-Wiltshire motion.
         step_noise_m, step_noise_m_s: standard deviations a step of independent noise on each coordinate, the form in
             which the study gives its R^w.
