@@ -8,6 +8,8 @@ first one is made. Leading dims broadcast everywhere.
 import torch
 from torch import Tensor
 
+from torchfilt.spaces import wrap_angle
+
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product of quaternions (..., 4): turn by b first, then by a."""
@@ -83,15 +85,19 @@ def to_euler(q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Heading, pitch and roll in rad, each (...), of attitudes (..., 4); the inverse of `from_euler`.
 
     Heading and roll are in [-pi, pi], pitch in [-pi/2, pi/2]. With the nose straight up or down only the difference or
-    the sum of heading and roll is known: their values there, and their derivatives, mean nothing.
+    the sum of heading and roll is known, and there are no derivatives; near it the angles still give the attitude back
+    to rounding.
+
+    Source: Bernardes and Viollet, Quaternion to Euler angles conversion, PLoS ONE 17 (2022).
     """
     x, y, z, w = q.unbind(-1)
-    # The forward axis in ENU components is the second column of the matrix; the last row gives the roll.
-    east, north, up = 2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)
-    right_up, top_up = 2 * (x * z - y * w), 1 - 2 * (x * x + y * y)
-    # Not asin: it loses half of the digits near the vertical.
-    pitch = torch.atan2(up, torch.hypot(east, north))
-    return torch.atan2(east, north), pitch, torch.atan2(-right_up, top_up)
+    # Products of cosine or sine of (roll + heading)/2 and of (roll - heading)/2 with those of pitch/2 + 45 degrees.
+    sum_sine, sum_cosine, difference_sine, difference_cosine = y - z, w - x, y + z, w + x
+    half_sum = torch.atan2(sum_sine, sum_cosine)
+    half_difference = torch.atan2(difference_sine, difference_cosine)
+    high = torch.hypot(difference_sine, difference_cosine)
+    pitch = 2 * torch.atan2(high, torch.hypot(sum_sine, sum_cosine)) - torch.pi / 2
+    return wrap_angle(half_sum - half_difference), pitch, wrap_angle(half_sum + half_difference)
 
 
 def skew(v: Tensor) -> Tensor:
