@@ -369,7 +369,7 @@ def test_controls_that_no_law_takes_are_refused():
     model = tf.StateSpaceModel(tf.Gaussian(torch.zeros(1, dtype=torch.float64), one), lambda x: law(x), law)
     tracker = tf.UnscentedKalmanFilter(model)
     y = torch.zeros(3, 1, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"controls \(3, 1\) were given, but the transition law has no argument u"):
+    with pytest.raises(ValueError, match=r"controls \(3, 1\) were given, but no law of the model has an argument u"):
         tracker(y, y)
-    with pytest.raises(ValueError, match=r"u \(1,\) were given, but the transition law has no argument u"):
+    with pytest.raises(ValueError, match=r"u \(1,\) were given, but no law of the model has an argument u"):
         tracker.step(tracker.init(), y[0], y[0])

@@ -9,6 +9,7 @@ from scipy import stats
 import torchfilt as tf
 from torchfilt.moves import MetropolisHastings
 from torchfilt.resampling import ess_below, systematic
+from torchfilt.types import StepInput
 
 # One Kolmogorov-Smirnov test raises a false alarm with this probability.
 FALSE_ALARM = 1e-5
@@ -43,7 +44,7 @@ def walk(move, model, parents, children, y, seed=0):
         move_normal=torch.randn(move.steps, *children.shape, generator=generator, dtype=torch.float64),
         move_uniform=torch.rand(move.steps, *children.shape[:-1], generator=generator, dtype=torch.float64),
     )
-    return move(model, before, after, y.expand(len(parents), 1, -1), None, None, noise, "none")
+    return move(model, before, after, StepInput(y.expand(len(parents), 1, -1), None, None, noise, "none"))
 
 
 @pytest.mark.parametrize("scale", [None, 0.3, 3.0])

@@ -54,7 +54,7 @@ LAYERS = [
     ["spaces"],
     ["gaussian", "particles", "noise"],
     ["types"],
-    ["moments", "resampling", "laws", "history"],
+    ["moments", "resampling", "laws", "history", "kernels"],
     ["model", "gp", "recording"],
     ["proposals", "moves", "models"],
     ["run"],

@@ -9,6 +9,7 @@ import torchfilt as tf
 from torchfilt.moments import cubature, unscented
 from torchfilt.proposals import Local, Prior
 from torchfilt.resampling import ess_below, systematic
+from torchfilt.types import StepInput
 
 
 def cloud(rows=(3,), n=40, own=True, shared=False, seed=0, dtype=torch.float64):
@@ -155,8 +156,8 @@ def test_points_that_stand_still_are_weighted_only():
     model, y = state_space(PLANE), tensor([[0.7]])
     local = Local(unscented(), "always", 0.0, weights="joint")
     particles = cloud(rows=(), own=False)._replace(x=cloud(rows=()).x[:, :2])
-    proposed = local(model, particles, y, None, None, None, "none", False)
-    reference = Prior()(model, particles, y, None, None, None, "none", False)
+    proposed = local(model, particles, StepInput(y, None, None, None, "none", False))
+    reference = Prior()(model, particles, StepInput(y, None, None, None, "none", False))
     assert torch.equal(proposed.x, particles.x) and torch.equal(proposed.log_weight, reference.log_weight)
 
 
@@ -185,7 +186,7 @@ def test_constructor_errors_name_the_rule():
         tf.BootstrapFilter(model, 1)
     with pytest.raises(ValueError, match="pooled redraw in 2 dimensions needs at least 4 particles, got 3"):
         tf.UnscentedParticleFilter(model, 3)
-    with pytest.raises(ValueError, match="a move walks on points"):
+    with pytest.raises(ValueError, match="a move or a kernel walks on points"):
         tf.UnscentedParticleFilter(model, 10, move=tf.moves.MetropolisHastings())
     with pytest.raises(TypeError, match="model must be a StateSpaceModel"):
         tf.BootstrapFilter("model")

@@ -1,15 +1,18 @@
 """Probabilistic filtering in PyTorch: one state-space model, any filter, gradients through everything."""
 
-from torchfilt import moments, moves, proposals, resampling, spaces
+from torchfilt import kernels, moments, moves, proposals, resampling, spaces
 from torchfilt.filters import (
+    AuxiliaryParticleFilter,
     BootstrapFilter,
     CubatureKalmanFilter,
+    ErrorStateKalmanFilter,
     ExtendedKalmanFilter,
     GaussHermiteKalmanFilter,
     GaussianFilter,
     KalmanFilter,
     LocallyLinearizedParticleFilter,
     ParticleFilter,
+    RegularizedParticleFilter,
     UnscentedKalmanFilter,
     UnscentedParticleFilter,
 )
@@ -33,8 +36,10 @@ _LATER = {"GPTransition": "gp"} | dict.fromkeys(
 __all__ = [
     "AdditiveGaussian",
     "Angle",
+    "AuxiliaryParticleFilter",
     "BootstrapFilter",
     "CubatureKalmanFilter",
+    "ErrorStateKalmanFilter",
     "Euclidean",
     "ExtendedKalmanFilter",
     "FilterError",
@@ -51,6 +56,7 @@ __all__ = [
     "ParticleFilter",
     "Particles",
     "Product",
+    "RegularizedParticleFilter",
     "StateSpaceModel",
     "StepInfo",
     "StepNoise",
@@ -59,6 +65,7 @@ __all__ = [
     "UnscentedParticleFilter",
     "gp",
     "io",
+    "kernels",
     "learning",
     "metrics",
     "missions",

@@ -128,6 +128,11 @@ class LinearGaussian(nn.Module):
             else:
                 hold(self, name, tensor, trainable)
 
+    @property
+    def takes_controls(self) -> bool:
+        """Whether u is looked at."""
+        return self.control_matrix is not None
+
     def linear_form(self, u: Tensor | None = None, dt: Tensor | float | None = None) -> LinearForm:
         """The matrices; u (..., k) enters the offset."""
         offset = self.offset
@@ -181,6 +186,11 @@ class AdditiveGaussian(nn.Module):
                 f"covariance must be {space.tangent_size} x {space.tangent_size} on {space!r}, got {noise_size}"
             )
         self.size = noise_size if space.size is None else space.size
+
+    @property
+    def takes_controls(self) -> bool:
+        """Whether the function looks at u."""
+        return self.style.takes_u
 
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None) -> Gaussian:
         """Law of y given x (..., d)."""

@@ -9,12 +9,12 @@ from torch.distributions import Distribution
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import LinearGaussian, call_style, check_factor, check_finite, takes_in_order
 from torchfilt.linalg import psd_factor
-from torchfilt.moments import Missing
+from torchfilt.types import Missing, StepInput
 
 Conditional = Gaussian | Distribution
 
 # What a law may offer beside the call; `torchfilt.moments` uses it.
-_SHORT_CUTS = ("linear_form", "pooled")
+_SHORT_CUTS = ("linear_form", "pooled", "first_order")
 
 
 def _short_cuts(law: Callable[..., Conditional]) -> list[str]:
@@ -24,12 +24,13 @@ def _short_cuts(law: Callable[..., Conditional]) -> list[str]:
 
 
 class StateSpaceModel(nn.Module):
-    """Initial law, transition law x_t | x_{t-1}, u_t, dt_t and measurement law y_t | x_t.
+    """Initial law, transition law x_t | x_{t-1}, u_t, dt_t and measurement law y_t | x_t, u_t, dt_t.
 
     Args:
         initial: a `Gaussian`, a `torch.distributions.Distribution`, or a module that returns one when called.
         transition: law called as ``transition(x, u, dt)``; arguments it does not take are left out.
-        observation: law called as ``observation(x)``.
+        observation: law called as ``observation(x, u, dt)`` with the control and time step of the motion that led to x;
+            arguments it does not take are left out.
 
     Raises:
         TypeError: initial is none of these, a law is not callable, linear laws of another dtype.
@@ -73,8 +74,10 @@ class StateSpaceModel(nn.Module):
                 )
 
     def takes_controls(self) -> bool:
-        """Whether the transition has a place for a control u."""
-        return self._styles["transition"].takes_u
+        """Whether a law has a place for a control u."""
+        return any(
+            getattr(getattr(self, name), "takes_controls", style.takes_u) for name, style in self._styles.items()
+        )
 
     def conditional(
         self, name: str, x: Tensor, u: Tensor | None = None, dt: Tensor | float | None = None
@@ -230,6 +233,11 @@ def log_prob(law: Conditional, y: Tensor, missing: Missing = "rows") -> Tensor:
             f"{type(law).__name__} is joint over its components: a measurement must miss all of them or none"
         )
     return torch.where(observed.all(-1), value, 0)
+
+
+def log_likelihood(model: StateSpaceModel, x: Tensor, step: StepInput) -> Tensor:
+    """Log-density (*batch, n) of the measurement at points x (*batch, n, d)."""
+    return log_prob(model.conditional("observation", x, step.u, step.dt), step.y, step.missing)
 
 
 def sample(law: Conditional, noise: Tensor, seed: int) -> Tensor:

@@ -4,10 +4,10 @@ Every rule turns (law, Gaussian) into one `Linearization`; one square-root recur
 rest. A quadrature is data; Taylor is the exact derivative. For laws that are linear in the state all rules agree.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from torch import Tensor
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
 from torchfilt.linalg import apply_factor, cholesky_downdate, for_points, log_abs_diagonal, triangularize, whiten
 from torchfilt.spaces import EUCLIDEAN, Euclidean, Space
+from torchfilt.types import Missing
 
 Law = Callable[..., Gaussian]
 
@@ -61,10 +62,15 @@ def lift(value: Tensor | float | None) -> Tensor | float | None:
 
 @dataclass(frozen=True)
 class Taylor:
-    """First-order expansion about the mean (the extended Kalman filter's rule), exact derivatives on any space."""
+    """First-order expansion about the mean (the extended Kalman filter's rule), exact derivatives on any space.
+
+    ``about``: a fixed point (d numbers) to expand about instead, as a filter does that is linearised once.
+    """
+
+    about: tuple[float, ...] | None = None
 
     def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
-        """One evaluation and one forward-mode sweep; none for laws that give their linear form."""
+        """One evaluation and one forward-mode sweep; no sweep for laws that give their linear form or first order."""
         linear_form = getattr(law, "linear_form", None)
         if linear_form is not None:
             matrix, offset, noise = linear_form(u, dt)
@@ -75,18 +81,38 @@ class Taylor:
             return Linearization(
                 mean if offset is None else mean + offset, matrix @ belief.factor(), None, noise, law_space(law)
             )
-        at_mean = law(belief.mean, u, dt)
-        factor = belief.factor().expand(*belief.mean.shape[:-1], -1, -1)
-        u_points, dt_points = lift(u), lift(dt)
+        centre = belief.mean
+        if self.about is not None:
+            centre = centre.new_tensor(self.about).expand_as(centre)
+        columns = belief.factor().expand(*centre.shape[:-1], -1, -1)
+        if self.about is not None:  # how far the mean lies from the point, as one more column
+            columns = cat_columns(columns, belief.space.local(centre, belief.mean).unsqueeze(-1))
+        at, slope = _first_order(law, centre, columns, belief.space, u, dt)
+        mean = at.mean
+        if self.about is not None:
+            mean, slope = at.space.retract(mean, slope[..., -1]), slope[..., :-1]
+        return Linearization(mean, slope, None, at.factor(), at.space)
 
-        def response(error: Tensor) -> Tensor:
-            points = belief.space.retract(belief.mean.unsqueeze(-2), error)
-            return at_mean.space.local(at_mean.mean.unsqueeze(-2), law(points, u_points, dt_points).mean)
 
-        # One row per direction, so a single forward-mode sweep over the batch gives the whole Jacobian.
-        directions = factor.mT.contiguous()
-        slope: Tensor = torch.func.jvp(response, (torch.zeros_like(directions),), (directions,))[1]
-        return Linearization(at_mean.mean, slope.mT, None, at_mean.factor(), at_mean.space)
+def _first_order(
+    law: Law, centre: Tensor, columns: Tensor, space: Space, u: Tensor | None, dt: Tensor | float | None
+) -> tuple[Gaussian, Tensor]:
+    """The law at ``centre`` and its derivative along each of ``columns`` (..., e, k): (..., e_y, k)."""
+    own = getattr(law, "first_order", None)
+    if own is not None:
+        at, jacobian = own(centre, u, dt)
+        return at, jacobian @ columns
+    at = law(centre, u, dt)
+    u_points, dt_points = lift(u), lift(dt)
+
+    def response(error: Tensor) -> Tensor:
+        points = space.retract(centre.unsqueeze(-2), error)
+        return at.space.local(at.mean.unsqueeze(-2), law(points, u_points, dt_points).mean)
+
+    # One row per direction, so a single forward-mode sweep over the batch gives the whole Jacobian.
+    directions = columns.mT.contiguous()
+    slope: Tensor = torch.func.jvp(response, (torch.zeros_like(directions),), (directions,))[1]
+    return at, slope.mT
 
 
 class Quadrature(NamedTuple):
@@ -204,9 +230,18 @@ def _quadrature(build: Callable[[int], Quadrature], size: int, dtype: torch.dtyp
     return held
 
 
-def taylor() -> Taylor:
-    """First-order Taylor rule."""
-    return Taylor()
+def taylor(about: Tensor | Sequence[float] | None = None) -> Taylor:
+    """First-order Taylor rule; ``about`` fixes the point of expansion (d numbers), default the mean of the moment.
+
+    Raises:
+        ValueError: a point that is not finite or not a vector.
+    """
+    if about is None:
+        return Taylor()
+    point = torch.as_tensor(about)
+    if point.dim() != 1 or not bool(torch.isfinite(point).all()):
+        raise ValueError(f"about must be one finite point of d numbers, got {about}")
+    return Taylor(tuple(point.tolist()))
 
 
 @lru_cache(maxsize=32)
@@ -313,10 +348,16 @@ class Update(NamedTuple):
     nis: Tensor
 
 
-Missing = Literal["none", "shared", "rows"]
-
-
-def update(law: Law, prior: Gaussian, y: Tensor, rule: Rule, missing: Missing = "rows", iterations: int = 1) -> Update:
+def update(
+    law: Law,
+    prior: Gaussian,
+    y: Tensor,
+    rule: Rule,
+    missing: Missing = "rows",
+    iterations: int = 1,
+    u: Tensor | None = None,
+    dt: Tensor | float | None = None,
+) -> Update:
     """Belief given a measurement y (..., d_y), whose NaN components are marginalised exactly.
 
     Args:
@@ -328,17 +369,18 @@ def update(law: Law, prior: Gaussian, y: Tensor, rule: Rule, missing: Missing = 
             that the rows share then stays shared), "rows" anything may be missing anywhere.
         iterations: above 1 the law is linearised again about the posterior: the iterated extended filter for `Taylor`,
             iterated posterior linearisation for quadratures.
+        u, dt: control and time step of the motion that led here, for measurement laws that look at them.
 
     Source: Garcia-Fernandez, Svensson, Morelande, Särkkä, IEEE TSP 63 (2015), for the iterated form.
     """
-    line = rule.linearize(law, prior, None, None)
+    line = rule.linearize(law, prior, u, dt)
     if y.shape[-1] != line.mean.shape[-1]:
         raise ValueError(f"the measurement has {y.shape[-1]} numbers, the observation law gives {line.mean.shape[-1]}")
     observed = _observed(line.space, y, missing)
     result = _condition(prior, line, None, y, observed)
     for _ in range(iterations - 1):
         posterior = result.belief
-        line = rule.linearize(law, posterior, None, None)
+        line = rule.linearize(law, posterior, u, dt)
         # slope S_posterior^-1 is the law's Jacobian; carry it back to the prior's own factor and mean.
         jacobian = torch.linalg.solve_triangular(posterior.factor(), line.slope, upper=False, left=False)
         line = line._replace(slope=jacobian @ prior.factor())

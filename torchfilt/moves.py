@@ -8,12 +8,9 @@ from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
 from torchfilt.linalg import apply_factor, steady_triangularize
-from torchfilt.model import StateSpaceModel, as_gaussian, log_prob
-from torchfilt.moments import Missing
+from torchfilt.model import StateSpaceModel, as_gaussian, log_likelihood, log_prob
 from torchfilt.particles import Particles
-from torchfilt.types import StepNoise
-
-Step = Tensor | float | None
+from torchfilt.types import StepInput
 
 
 class Moved(NamedTuple):
@@ -53,39 +50,26 @@ class MetropolisHastings:
         if self.target not in ("transition", "predictive"):
             raise ValueError(f"target must be 'transition' or 'predictive', got {self.target!r}")
 
-    def __call__(
-        self,
-        model: StateSpaceModel,
-        before: Particles,
-        particles: Particles,
-        y: Tensor,
-        u: Tensor | None,
-        dt: Step,
-        noise: StepNoise,
-        missing: Missing,
-    ) -> Moved:
+    def __call__(self, model: StateSpaceModel, before: Particles, particles: Particles, step: StepInput) -> Moved:
         """Walk.
 
         Args:
             model: the three laws.
             before: particles of the step before, in the order of their children.
             particles: weighted by the measurement, x (*batch, n, d).
-            y: (*batch, 1, m).
-            u, dt: with room for the particle axis.
-            noise: move_normal (steps, *batch, n, e), move_uniform (steps, *batch, n).
-            missing: pattern of NaNs in y.
+            step: noise.move_normal (steps, *batch, n, e), noise.move_uniform (steps, *batch, n).
         """
+        noise = step.noise
         assert noise.move_normal is not None and noise.move_uniform is not None
         space, x = particles.space, particles.x
-        arrival = model.conditional("transition", before.x, u, dt)
+        arrival = model.conditional("transition", before.x, step.u, step.dt)
         if self.target == "predictive":
             arrival = _predictive(as_gaussian(arrival), before.weights)
         factor = _cloud_factor(particles)
         size = self.scale if self.scale is not None else 2.38 / factor.shape[-1] ** 0.5
 
         def target(points: Tensor) -> Tensor:
-            seen = log_prob(model.conditional("observation", points), y, missing)
-            return seen + log_prob(arrival, points, "none")
+            return log_likelihood(model, points, step) + log_prob(arrival, points, "none")
 
         here = target(x)
         rates = []

@@ -8,13 +8,12 @@ from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
 from torchfilt.linalg import apply_factor, steady_triangularize
-from torchfilt.model import Conditional, StateSpaceModel, as_gaussian, log_prob, sample
-from torchfilt.moments import Missing, Rule, check_rule_type, check_transition_space, predict, update
+from torchfilt.model import Conditional, StateSpaceModel, as_gaussian, log_likelihood, log_prob, sample
+from torchfilt.moments import Rule, check_rule_type, check_transition_space, predict, update
 from torchfilt.particles import Particles, uniform_log_weights
 from torchfilt.spaces import EUCLIDEAN, Space, weighted_sum
-from torchfilt.types import StepNoise
+from torchfilt.types import StepInput
 
-Step = Tensor | float | None
 Evidence = Literal["unbiased", "linearized", "approximate"]
 Redraw = Literal["never", "resample", "always"]
 Weights = Literal["marginal", "joint"]
@@ -56,17 +55,7 @@ class Proposal(Protocol):
         """Share uncertainty anew between particles and their covariances, after resampling."""
         ...
 
-    def __call__(
-        self,
-        model: StateSpaceModel,
-        particles: Particles,
-        y: Tensor,
-        u: Tensor | None,
-        dt: Step,
-        noise: StepNoise,
-        missing: Missing,
-        move: bool,
-    ) -> Proposed:
+    def __call__(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> Proposed:
         """Move, measure and weight; shapes as in `Local`."""
         ...
 
@@ -91,24 +80,43 @@ class Prior:
         """Points have no uncertainty of their own to share."""
         return particles
 
-    def __call__(
-        self,
-        model: StateSpaceModel,
-        particles: Particles,
-        y: Tensor,
-        u: Tensor | None,
-        dt: Step,
-        noise: StepNoise,
-        missing: Missing,
-        move: bool,
-    ) -> Proposed:
+    def __call__(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> Proposed:
         """Shapes as in `Local`."""
         x, space = particles.x, particles.space
-        if move:
-            assert noise.proposal is not None
-            law = model.conditional("transition", x, u, dt)
-            x, space = sample(law, noise.proposal, noise.seed), _next_space(law, space)
-        return Proposed(x, None, log_prob(model.conditional("observation", x), y, missing), space)
+        if step.move:
+            assert step.noise.proposal is not None
+            law = model.conditional("transition", x, step.u, step.dt)
+            x, space = sample(law, step.noise.proposal, step.noise.seed), _next_space(law, space)
+        return Proposed(x, None, log_likelihood(model, x, step), space)
+
+
+@dataclass(frozen=True)
+class LookAhead:
+    """First-stage weights: each particle's own times p(y | mean of its transition) ** power.
+
+    Args:
+        power: 1 is the auxiliary filter as printed, 0 no look ahead at all.
+
+    Raises:
+        ValueError: power outside [0, 1].
+
+    Source: Pitt and Shephard, Filtering via simulation: auxiliary particle filters, JASA 94 (1999).
+    """
+
+    power: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.power <= 1:
+            raise ValueError(f"power must be in [0, 1], got {self.power}")
+
+    def __call__(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> Tensor:
+        """Log-weights (*batch, n), not normalised; where the look ahead has no density at all, the particle's own."""
+        law = model.conditional("transition", particles.x, step.u, step.dt)
+        ahead = self.power * log_likelihood(model, law.mean, step)
+        preferred = particles.log_weights + ahead
+        # A row in which nothing looks likely, or something is not a number, is resampled as any other filter would.
+        usable = torch.isfinite(torch.logsumexp(preferred, -1, keepdim=True))
+        return torch.where(usable, preferred, particles.log_weights)
 
 
 @dataclass(frozen=True)
@@ -247,57 +255,43 @@ class Local:
         x = space.retract(mean.unsqueeze(-2), ((1 - self.split) ** 0.5 * matched).mT)
         return particles._replace(x=x, scale_tril=(self.split**0.5 * whole).unsqueeze(-3))
 
-    def __call__(
-        self,
-        model: StateSpaceModel,
-        particles: Particles,
-        y: Tensor,
-        u: Tensor | None,
-        dt: Step,
-        noise: StepNoise,
-        missing: Missing,
-        move: bool,
-    ) -> Proposed:
+    def __call__(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> Proposed:
         """One predicted and updated Gaussian a particle.
 
         Args:
             model: the three laws.
             particles: x (*batch, n, d).
-            y: (*batch, 1, m).
-            u, dt: with room for the particle axis.
-            noise: proposal (*batch, n, e) for joint weights.
-            missing: pattern of NaNs in y.
-            move: False leaves the motion out.
+            step: noise.proposal (*batch, n, e) for joint weights.
         """
-        if not move and particles.scale_tril is None:
+        if not step.move and particles.scale_tril is None:
             # Points that stand still have no law to be drawn from again: the measurement weights them.
-            return Prior()(model, particles, y, u, dt, noise, missing, move)
-        predicted, arrival = self._predict(model, particles, u, dt, move)
-        result = update(model.moments("observation"), predicted, y, self.rule, missing)
+            return Prior()(model, particles, step)
+        predicted, arrival = self._predict(model, particles, step)
+        result = update(model.moments("observation"), predicted, step.y, self.rule, step.missing, u=step.u, dt=step.dt)
         posterior = result.belief
         if self.weights == "marginal":
             return Proposed(posterior.mean, posterior.scale_tril, result.log_likelihood, posterior.space)
-        assert noise.proposal is not None
-        x = posterior.sample(noise.proposal)
+        assert step.noise.proposal is not None
+        x = posterior.sample(step.noise.proposal)
         ratio = log_prob(arrival, x, "none") - posterior.log_prob(x)
-        log_weight = log_prob(model.conditional("observation", x), y, missing) + ratio
+        log_weight = log_likelihood(model, x, step) + ratio
         return Proposed(x, None if self.split == 0 else posterior.scale_tril, log_weight, posterior.space)
 
-    def _predict(
-        self, model: StateSpaceModel, particles: Particles, u: Tensor | None, dt: Step, move: bool
-    ) -> tuple[Gaussian, Conditional]:
+    def _predict(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> tuple[Gaussian, Conditional]:
         """Predicted Gaussians, and the law that joint weights are made with: the transition itself for points."""
         if particles.scale_tril is not None:
             bank = Gaussian(particles.x, particles.scale_tril, particles.space)
-            predicted = predict(model.moments("transition"), bank, self.rule, u, dt) if move else bank
+            if not step.move:
+                return bank, bank
+            predicted = predict(model.moments("transition"), bank, self.rule, step.u, step.dt)
             return predicted, predicted
-        law = model.conditional("transition", particles.x, u, dt)
-        step = as_gaussian(law)
+        law = model.conditional("transition", particles.x, step.u, step.dt)
+        ahead = as_gaussian(law)
         space = _next_space(law, particles.space)
-        factor = step.factor()
+        factor = ahead.factor()
         if factor.dim() == 2:  # shared by everyone: what particles carry has a row and a particle axis
             factor = factor.expand(*particles.x.shape[:-2], 1, -1, -1)
-        return Gaussian(step.mean, factor, space), law
+        return Gaussian(ahead.mean, factor, space), law
 
 
 def _equal_weights(x: Tensor, factor: Tensor | None, space: Space) -> Particles:

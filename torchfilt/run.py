@@ -9,14 +9,12 @@ from torch import Tensor, nn
 from torchfilt.gaussian import Gaussian
 from torchfilt.history import History
 from torchfilt.model import StateSpaceModel
-from torchfilt.moments import Missing
 from torchfilt.particles import Particles
 from torchfilt.recording import Record, Recorder
-from torchfilt.types import FilterError, FilterState, StepInfo, StepNoise
+from torchfilt.types import FilterError, FilterState, Missing, Step, StepInfo, StepNoise
 
 B = TypeVar("B", Gaussian, Particles)
 Evidence = Literal["exact", "unbiased", "linearized", "approximate"]
-Step = Tensor | float | None
 
 
 class Filter(nn.Module, Generic[B]):
@@ -126,7 +124,7 @@ class Filter(nn.Module, Generic[B]):
     def _check_taken(self, u: Tensor, name: str) -> None:
         """A control that no law would look at is a mistake."""
         if not self.model.takes_controls():
-            raise ValueError(f"{name} {tuple(u.shape)} were given, but the transition law has no argument u")
+            raise ValueError(f"{name} {tuple(u.shape)} were given, but no law of the model has an argument u")
 
     def forward(
         self,

@@ -1,6 +1,6 @@
-"""What filters carry and what they report."""
+"""What filters carry, what a step is given and what it reports."""
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeVar
 
 from torch import Tensor
 
@@ -8,6 +8,8 @@ from torchfilt.gaussian import Gaussian
 from torchfilt.particles import Particles
 
 B = TypeVar("B", Gaussian, Particles)
+Step = Tensor | float | None
+Missing = Literal["none", "shared", "rows"]
 
 
 class FilterState(NamedTuple, Generic[B]):
@@ -41,8 +43,8 @@ class StepNoise(NamedTuple):
     """Random numbers of one step, drawn outside so that the step itself is a pure function.
 
     proposal (*batch, n, e) standard normals or None; resampling (*batch, k) uniforms; redraw (*batch, n, e) or None;
-    move_normal (moves, *batch, n, e) and move_uniform (moves, *batch, n), or None; seed: for laws that draw by
-    themselves.
+    move_normal (moves, *batch, n, e) and move_uniform (moves, *batch, n), or None; kernel (*batch, n, k) normals of a
+    regularisation, or None; seed: for laws that draw by themselves.
     """
 
     proposal: Tensor | None
@@ -50,7 +52,23 @@ class StepNoise(NamedTuple):
     redraw: Tensor | None = None
     move_normal: Tensor | None = None
     move_uniform: Tensor | None = None
+    kernel: Tensor | None = None
     seed: int = 0
+
+
+class StepInput(NamedTuple):
+    """What one step of the particle loop is given; tensors have room for the particle axis.
+
+    y (*batch, 1, m), NaN means not measured; u (*batch, 1, k), (k,) or None; dt number, (*batch, 1, 1) or None, s;
+    missing: what is known of the NaNs in y; move: False leaves the motion out.
+    """
+
+    y: Tensor
+    u: Tensor | None
+    dt: Step
+    noise: StepNoise
+    missing: Missing = "rows"
+    move: bool = True
 
 
 class FilterError(ArithmeticError):

@@ -59,7 +59,7 @@ def test_rows_choose_for_themselves_when_to_resample():
     state, info = filter.step(state, y)
     assert info.ess[0] > 50 > info.ess[1]
     noise = filter.draw(state.belief, state.step, state.seed)
-    belief, ancestors, chosen = filter._resample(state.belief, noise.resampling)
+    belief, ancestors, chosen = filter._resample(state.belief, state.belief.log_weights, noise.resampling)
     assert chosen.tolist() == [False, True]
     assert torch.equal(ancestors[0], torch.arange(100)) and len(ancestors[1].unique()) < 60
     assert torch.equal(belief.x[0], state.belief.x[0]) and torch.equal(

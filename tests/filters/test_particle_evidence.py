@@ -13,6 +13,7 @@ from particle_problem import PLANE, POLICIES, bias_score, gaussian, replicate, s
 import torchfilt as tf
 from torchfilt.moments import taylor, unscented
 from torchfilt.resampling import ess_below, systematic
+from torchfilt.types import StepInput
 
 Z = 4.5
 ADAPTIVE = {name: POLICIES[name] for name in ("never", "adaptive-systematic", "always-systematic")}
@@ -80,7 +81,7 @@ def test_joint_and_marginal_weights_agree_on_a_linear_model(rule):
         )
         state = filter.init()
         noise = filter.draw(state.belief, 0, 0)
-        parts[weights] = filter.proposal(model, state.belief, ys[0].unsqueeze(0), None, None, noise, "none", True)
+        parts[weights] = filter.proposal(model, state.belief, StepInput(ys[0].unsqueeze(0), None, None, noise, "none"))
     np.testing.assert_allclose(parts["joint"].log_weight, parts["marginal"].log_weight, rtol=0, atol=1e-12)
 
 

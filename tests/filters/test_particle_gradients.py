@@ -51,8 +51,9 @@ FORMS = {
 class PathwiseOnly(tf.ParticleFilter):
     """The same filter without the score of the chosen ancestors."""
 
-    def _select(self, belief, ancestors, chosen):
-        return super()._select(belief._replace(log_weights=belief.log_weights.detach()), ancestors, chosen)
+    def _resample(self, belief, preferred, uniforms):
+        belief = belief._replace(log_weights=preferred.detach())
+        return super()._resample(belief, belief.log_weights, uniforms)
 
 
 def gradients(make, seed, batches=20, rows=100, pathwise=False):

@@ -2,28 +2,34 @@
 
 from torchfilt.filters.gaussian import (
     CubatureKalmanFilter,
+    ErrorStateKalmanFilter,
     ExtendedKalmanFilter,
     GaussHermiteKalmanFilter,
     GaussianFilter,
     KalmanFilter,
     UnscentedKalmanFilter,
 )
-from torchfilt.filters.particle import (
+from torchfilt.filters.particle import ParticleFilter
+from torchfilt.filters.particle_methods import (
+    AuxiliaryParticleFilter,
     BootstrapFilter,
     LocallyLinearizedParticleFilter,
-    ParticleFilter,
+    RegularizedParticleFilter,
     UnscentedParticleFilter,
 )
 
 __all__ = [
+    "AuxiliaryParticleFilter",
     "BootstrapFilter",
     "CubatureKalmanFilter",
+    "ErrorStateKalmanFilter",
     "ExtendedKalmanFilter",
     "GaussHermiteKalmanFilter",
     "GaussianFilter",
     "KalmanFilter",
     "LocallyLinearizedParticleFilter",
     "ParticleFilter",
+    "RegularizedParticleFilter",
     "UnscentedKalmanFilter",
     "UnscentedParticleFilter",
 ]

@@ -5,7 +5,6 @@ from torch import Tensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.model import StateSpaceModel
 from torchfilt.moments import (
-    Missing,
     Rule,
     Update,
     check_rule_type,
@@ -16,8 +15,8 @@ from torchfilt.moments import (
     unscented,
     update,
 )
-from torchfilt.run import Filter, Step, check_model
-from torchfilt.types import FilterState, StepInfo, StepNoise
+from torchfilt.run import Filter, check_model
+from torchfilt.types import FilterState, Missing, Step, StepInfo, StepNoise
 
 
 class GaussianFilter(Filter[Gaussian]):
@@ -60,9 +59,11 @@ class GaussianFilter(Filter[Gaussian]):
         """Belief after the motion; arguments as in `advance`."""
         return predict(self.model.moments("transition"), belief, self.rule, u, dt)
 
-    def update(self, belief: Gaussian, y: Tensor, missing: Missing = "rows") -> Update:
-        """Belief after a measurement y (*batch, m), with innovation and likelihood."""
-        return update(self.model.moments("observation"), belief, y, self.rule, missing, self.iterations)
+    def update(
+        self, belief: Gaussian, y: Tensor, missing: Missing = "rows", u: Tensor | None = None, dt: Step = None
+    ) -> Update:
+        """Belief after a measurement y (*batch, m), with innovation and likelihood; arguments as in `advance`."""
+        return update(self.model.moments("observation"), belief, y, self.rule, missing, self.iterations, u, dt)
 
     def advance(
         self,
@@ -77,7 +78,7 @@ class GaussianFilter(Filter[Gaussian]):
         """See `Filter.advance`; noise is not used."""
         if predict:
             belief = self.predict(belief, u, dt)
-        result = self.update(belief, y, missing)
+        result = self.update(belief, y, missing, u, dt)
         posterior = result.belief
         # A factor made by a triangularisation cannot lose definiteness but by NaN; a failed downdate is NaN as well.
         # NaN and infinity survive a sum, and only what is neither leaves nothing when it is taken from itself.
@@ -119,6 +120,37 @@ def ExtendedKalmanFilter(model: StateSpaceModel, iterations: int = 1) -> Gaussia
     Source: Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE TAC 38 (1993).
     """
     return GaussianFilter(model, taylor(), iterations)
+
+
+def ErrorStateKalmanFilter(model: StateSpaceModel, feedback: bool = True, iterations: int = 1) -> GaussianFilter:
+    """The indirect form: a reference that moves by the full law, and a Gaussian over its error in the tangent space.
+
+    On a space the recursion is just that: the mean is the reference, the factor belongs to the error, ``retract`` feeds
+    the estimated error back into the reference and leaves zero in its place. For a model whose *state* is the error of
+    an inertial system, ``feedback`` corrects that system at each step, so that the law is expanded about the estimated
+    error; without it the system runs open loop and the law is expanded about the prior's mean for ever, which is right
+    as long as the error stays small. An attitude on `UnitQuaternion` makes this the multiplicative filter.
+
+    Args:
+        model: the three laws; the prior's mean is the reference's start.
+        feedback: see above.
+        iterations: linearisations of the measurement law, as in `ExtendedKalmanFilter`; with feedback only.
+
+    Raises:
+        ValueError: iterations above 1 or a prior with a batch of its own, without feedback.
+
+    Sources: Farrell, Aided Navigation (2008), section 5.10; Markley, Attitude error representations for Kalman
+        filtering, JGCD 26 (2003).
+    """
+    if feedback:
+        return GaussianFilter(model, taylor(), iterations)
+    check_model(model)
+    if iterations != 1:
+        raise ValueError(f"without feedback the law is linearised once: iterations must be 1, got {iterations}")
+    mean = model.prior().mean
+    if mean.dim() != 1:
+        raise ValueError(f"without feedback the prior's mean must be one point for all rows, got {tuple(mean.shape)}")
+    return GaussianFilter(model, taylor(mean))
 
 
 def UnscentedKalmanFilter(

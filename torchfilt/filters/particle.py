@@ -8,23 +8,23 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from torchfilt.gaussian import Gaussian
+from torchfilt.kernels import Regularize, check_kernel
 from torchfilt.linalg import for_points
 from torchfilt.model import Conditional, StateSpaceModel, check_batch
-from torchfilt.moments import Missing, Rule, unscented
 from torchfilt.moves import MetropolisHastings
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
-from torchfilt.proposals import Local, Prior, Proposal, Proposed, Redraw, Weights
-from torchfilt.resampling import Resampler, by_component, ess_below, gather_particles, systematic
-from torchfilt.run import Filter, Step
-from torchfilt.types import FilterState, StepInfo, StepNoise
+from torchfilt.proposals import LookAhead, Proposal, Proposed
+from torchfilt.resampling import Resampler, by_component, gather_particles, systematic
+from torchfilt.run import Filter
+from torchfilt.types import FilterState, Missing, Step, StepInfo, StepInput, StepNoise
 
 # Purposes of random numbers: each has a sequence of its own.
-_INITIAL, _INITIAL_SPLIT, _STEP, _MOVE, _ACCEPT, _OWN = range(6)
+_INITIAL, _INITIAL_SPLIT, _STEP, _MOVE, _ACCEPT, _OWN, _KERNEL = range(7)
 
 
 class ParticleFilter(Filter[Particles]):
-    """Weighted particles: resample, propose, weight, move.
+    """Weighted particles: resample, smooth by a kernel, propose, weight, move.
 
     Resampling comes first in a step, so the belief that a step returns is the weighted one. A row in which no particle
     can explain the measurement keeps its particles and the weights they had, reports ``log_likelihood = -inf`` and
@@ -40,10 +40,13 @@ class ParticleFilter(Filter[Particles]):
         proposal: `Prior`, `Local` or anything that is a `Proposal`.
         resampler: scheme and policy, such as ``ess_below(0.5)`` or ``systematic`` (always).
         move: `MetropolisHastings`, for proposals that leave points; or None.
+        kernel: `Regularize`, which draws resampled particles anew; for proposals that leave points; or None.
+        look_ahead: `LookAhead`, resample by the measurement that comes next; or None.
         fast_normals: draw float64 normals as float32 and cast them: 2.7 times cheaper, 24 bits fine.
 
     Raises:
-        ValueError: fewer than two particles (pooled redraw: than e + 2), a move on particles with covariances.
+        ValueError: fewer than two particles (pooled redraw: than e + 2), a move or a kernel on particles with
+            covariances.
 
         TypeError: not a model, not a resampler.
 
@@ -61,6 +64,9 @@ class ParticleFilter(Filter[Particles]):
         resampler: Resampler = systematic,
         move: MetropolisHastings | None = None,
         fast_normals: bool = False,
+        *,
+        kernel: Regularize | None = None,
+        look_ahead: LookAhead | None = None,
     ) -> None:
         super().__init__(model)
         if not isinstance(resampler, Resampler):
@@ -72,16 +78,19 @@ class ParticleFilter(Filter[Particles]):
             raise ValueError(
                 f"a pooled redraw in {size} dimensions needs at least {size + 2} particles, got {particles}"
             )
-        if move is not None and not proposal.leaves_points:
+        check_kernel(kernel)
+        if (move is not None or kernel is not None) and not proposal.leaves_points:
             raise ValueError(
-                "a move walks on points, this proposal leaves a Gaussian for each particle; "
+                "a move or a kernel walks on points, this proposal leaves a Gaussian for each particle; "
                 "take Prior() or Local(..., redraw='always', split=0.0, weights='joint')"
             )
         self.particles, self.proposal, self.resampler, self.move = particles, proposal, resampler, move
-        self.fast_normals = fast_normals
+        self.kernel, self.look_ahead, self.fast_normals = kernel, look_ahead, fast_normals
         linear = model.is_linear() and isinstance(model.initial(), Gaussian)
         # Where linearisation leaves nothing out, a bank of Gaussians is a proper importance sampler.
         self.evidence = "unbiased" if linear and proposal.evidence == "linearized" else proposal.evidence
+        if kernel is not None:
+            self.evidence = "approximate"
 
     def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[Particles]:
         """Particles of the initial law for ``batch_shape`` independent runs, x (*batch, n, d).
@@ -112,7 +121,9 @@ class ParticleFilter(Filter[Particles]):
         count = self.resampler.uniforms(shape[-1]) if self.resampler.threshold > 0 else 0
         uniforms = torch.rand((*shape[:-1], count), generator=generator, dtype=torch.float64, device=like.device)
         redraw = source.next_normal(full, generator, like) if self.proposal.needs_redraw_noise else None
-        normal = uniform = None
+        normal = uniform = kernel = None
+        if self.kernel is not None:
+            kernel = source.normal((*shape, self.kernel.normals(self.tangent_size)), step, _KERNEL, like)
         if self.move is not None:
             normal = source.normal((self.move.steps, *full), step, _MOVE, like)
             uniform = source.uniform((self.move.steps, *shape), step, _ACCEPT, like)
@@ -122,6 +133,7 @@ class ParticleFilter(Filter[Particles]):
             redraw,
             normal,
             uniform,
+            kernel,
             source.seed_of(step, _OWN),
         )
 
@@ -142,54 +154,75 @@ class ParticleFilter(Filter[Particles]):
         """
         if noise is None:
             raise ValueError("a particle filter's step needs its random numbers: noise=filter.draw(belief, step, seed)")
+        u = u.unsqueeze(-2) if u is not None and u.dim() > 1 else u
+        dt = dt.unsqueeze(-2) if isinstance(dt, Tensor) and dt.dim() > 1 else dt
+        step = StepInput(y.unsqueeze(-2), u, dt, noise, missing, predict)
         if predict:
-            belief, ancestors, chosen = self._resample(belief, noise.resampling)
-            belief = self.proposal.refresh(belief, noise.redraw, chosen)
+            belief, ancestors = self._select(belief, step)
         else:
             belief = by_component(belief)
             ancestors = torch.arange(belief.x.shape[-2], device=belief.x.device).expand_as(belief.log_weights)
-        u = u.unsqueeze(-2) if u is not None and u.dim() > 1 else u
-        dt = dt.unsqueeze(-2) if isinstance(dt, Tensor) and dt.dim() > 1 else dt
-        y = y.unsqueeze(-2)
-        proposed = self.proposal(self.model, belief, y, u, dt, noise, missing, predict)
+        proposed = self.proposal(self.model, belief, step)
         after, log_likelihood, ok = _reweight(belief, proposed)
         rate = None
         if self.move is not None and predict:
-            x, rate = self.move(self.model, belief, after, y, u, dt, noise, missing)
+            x, rate = self.move(self.model, belief, after, step)
             after = after._replace(x=x)
         info = StepInfo(
             log_likelihood, ok, ess=after.ess, ancestors=ancestors, acceptance_rate=rate, evidence=self.evidence
         )
         return after, info
 
-    def _resample(self, belief: Particles, uniforms: Tensor) -> tuple[Particles, Tensor, Tensor | None]:
-        """Particles with new weights, their ancestors (*batch, n) and the rows that were resampled (None: all)."""
+    def _select(self, belief: Particles, step: StepInput) -> tuple[Particles, Tensor]:
+        """Resampled, smoothed and refreshed particles and their ancestors (*batch, n)."""
+        cloud, preferred = belief, belief.log_weights
+        if self.look_ahead is not None:
+            preferred = self.look_ahead(self.model, belief, step)
+        belief, ancestors, chosen = self._resample(belief, preferred, step.noise.resampling)
+        if self.kernel is not None:
+            assert step.noise.kernel is not None
+            belief = self.kernel(cloud, belief, step.noise.kernel, chosen)
+        return self.proposal.refresh(belief, step.noise.redraw, chosen), ancestors
+
+    def _resample(
+        self, belief: Particles, preferred: Tensor, uniforms: Tensor
+    ) -> tuple[Particles, Tensor, Tensor | None]:
+        """Particles drawn by the log-weights ``preferred`` (*batch, n), with weights that make up for it.
+
+        Also their ancestors (*batch, n), and the rows that were resampled; None for all.
+        """
         n = belief.log_weights.shape[-1]
-        weights = belief.weights
+        weights = belief.weights if preferred is belief.log_weights else torch.softmax(preferred, -1)
         weights = weights.detach() if weights.requires_grad else weights
         if self.resampler.threshold == math.inf:
             ancestors = self.resampler(weights, uniforms)
-            return self._select(belief, ancestors, None), ancestors, None
+            return _copies(belief, preferred, ancestors, None), ancestors, None
         everyone = torch.arange(n, device=belief.x.device)
         few = 1 / weights.square().sum(-1) < self.resampler.threshold * n
         if self.resampler.threshold == 0 or not (torch.compiler.is_compiling() or bool(few.any())):
             return by_component(belief), everyone.expand_as(belief.log_weights), torch.zeros_like(few)
         ancestors = torch.where(few.unsqueeze(-1), self.resampler(weights, uniforms), everyone)
-        return self._select(belief, ancestors, few), ancestors, few
+        return _copies(belief, preferred, ancestors, few), ancestors, few
 
-    def _select(self, belief: Particles, ancestors: Tensor, chosen: Tensor | None) -> Particles:
-        x = gather_particles(belief.x, ancestors)
-        factor = belief.scale_tril
-        if factor is not None and factor.shape[-3] > 1:
-            factor = gather_particles(factor, ancestors)
-        log_weights = belief.log_weights.new_full((), -math.log(ancestors.shape[-1])).expand(ancestors.shape)
-        if belief.log_weights.requires_grad and torch.is_grad_enabled():
-            score = belief.log_weights.gather(-1, ancestors)
-            # A particle of weight zero has no ancestor but may stand in the unchosen rows.
-            log_weights = log_weights + torch.where(torch.isfinite(score), score - score.detach(), 0)
-        if chosen is not None:
-            log_weights = torch.where(chosen.unsqueeze(-1), log_weights, belief.log_weights)
-        return Particles(x, log_weights, factor, belief.space)
+
+def _copies(belief: Particles, preferred: Tensor, ancestors: Tensor, chosen: Tensor | None) -> Particles:
+    """The ancestors' copies, weighted by what they were preferred beyond their own weight."""
+    x = gather_particles(belief.x, ancestors)
+    factor = belief.scale_tril
+    if factor is not None and factor.shape[-3] > 1:
+        factor = gather_particles(factor, ancestors)
+    log_weights = belief.log_weights.new_full((), -math.log(ancestors.shape[-1])).expand(ancestors.shape)
+    if preferred is not belief.log_weights:
+        # Constant in the gradient: what the weights lose by it, the score of the choice gives back.
+        choice = torch.log_softmax(preferred, -1).detach()
+        log_weights = log_weights + (belief.log_weights - choice).gather(-1, ancestors)
+    elif preferred.requires_grad and torch.is_grad_enabled():
+        score = preferred.gather(-1, ancestors)
+        # A particle of weight zero has no ancestor but may stand in the unchosen rows.
+        log_weights = log_weights + torch.where(torch.isfinite(score), score - score.detach(), 0)
+    if chosen is not None:
+        log_weights = torch.where(chosen.unsqueeze(-1), log_weights, belief.log_weights)
+    return Particles(x, log_weights, factor, belief.space)
 
 
 def _normalise(log_weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -259,59 +292,3 @@ def _draw_distribution(law: Distribution, shape: tuple[int, ...], seed: int) -> 
         draws: Tensor = wide.rsample(shape[-1:]) if wide.has_rsample else wide.sample(shape[-1:])
     draws = draws if law.event_shape or law.batch_shape else draws.unsqueeze(-1)
     return draws.movedim(0, -2)
-
-
-def BootstrapFilter(
-    model: StateSpaceModel,
-    particles: int = 1000,
-    resampler: Resampler = systematic,
-    move: MetropolisHastings | None = None,
-    fast_normals: bool = False,
-) -> ParticleFilter:
-    """Particles moved by the transition law and weighted by the measurement.
-
-    Source: Gordon, Salmond, Smith, IEE Proceedings F 140 (1993).
-    """
-    return ParticleFilter(model, particles, Prior(), resampler, move, fast_normals)
-
-
-def UnscentedParticleFilter(
-    model: StateSpaceModel,
-    particles: int = 200,
-    rule: Rule | None = None,
-    split: float | None = 0.6,
-    redraw: Redraw = "always",
-    pooled: bool = True,
-    weights: Weights = "marginal",
-    resampler: Resampler | None = None,
-    move: MetropolisHastings | None = None,
-) -> ParticleFilter:
-    """An unscented Kalman filter for each particle, uncertainty shared between spread and local covariance.
-
-    The default keeps the fraction ``split`` of the cloud's covariance in each particle and moment-matches the redrawn
-    centres, which is what makes the method robust; ``pooled=False, split=0.0, weights="joint"`` is the proper
-    importance sampler of van der Merwe et al., ``split=None`` the literal form that keeps each P_i in full as well.
-
-    Sources: van der Merwe, Doucet, de Freitas, Wan, NIPS 13 (2000); Wei, Song, Zhang (2012), equation 7.
-    """
-    local = Local(rule or unscented(), redraw, split, pooled, weights)
-    return ParticleFilter(model, particles, local, resampler or ess_below(0.5), move)
-
-
-def LocallyLinearizedParticleFilter(
-    model: StateSpaceModel,
-    particles: int = 100,
-    rule: Rule | None = None,
-    split: float | None = 0.5,
-    redraw: Redraw = "never",
-    pooled: bool = False,
-    weights: Weights = "marginal",
-    resampler: Resampler | None = None,
-) -> ParticleFilter:
-    """A bank of Gaussian filters with weights: the same loop and proposal as the unscented particle filter.
-
-    Particles start as draws that hold the share 1 - split of the prior's covariance and are not redrawn, because
-    drawing from a covariance that is also kept counts it twice.
-    """
-    local = Local(rule or unscented(), redraw, split, pooled, weights)
-    return ParticleFilter(model, particles, local, resampler or ess_below(0.5))

@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.model import Conditional, StateSpaceModel, log_prob
-from torchfilt.moments import Missing, Rule, predict, unscented, update
+from torchfilt.model import Conditional, StateSpaceModel, log_likelihood, log_prob
+from torchfilt.moments import Rule, predict, unscented, update
 from torchfilt.particles import Particles
 from torchfilt.proposals import Evidence, Local, Proposed
-from torchfilt.types import StepNoise
-
-Step = Tensor | float | None
+from torchfilt.types import StepInput
 
 
 @dataclass(frozen=True)
@@ -42,25 +40,17 @@ class EquationSeven:
         """Nothing is shared anew."""
         return particles
 
-    def __call__(
-        self,
-        model: StateSpaceModel,
-        particles: Particles,
-        y: Tensor,
-        u: Tensor | None,
-        dt: Step,
-        noise: StepNoise,
-        missing: Missing,
-        move: bool,
-    ) -> Proposed:
+    def __call__(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> Proposed:
         """Arguments as in `torchfilt.proposals.Local`."""
-        assert noise.proposal is not None and particles.scale_tril is not None
+        assert step.noise.proposal is not None and particles.scale_tril is not None
         bank = Gaussian(particles.x, particles.scale_tril, particles.space)
-        predicted = predict(model.moments("transition"), bank, self.rule, u, dt) if move else bank
-        posterior = update(model.moments("observation"), predicted, y, self.rule, missing).belief
-        x = posterior.sample(noise.proposal)
-        came = log_prob(model.conditional("transition", particles.x, u, dt), x) if move else bank.log_prob(x)
-        log_weight = log_prob(model.conditional("observation", x), y, missing) + came - posterior.log_prob(x)
+        u, dt = step.u, step.dt
+        predicted = predict(model.moments("transition"), bank, self.rule, u, dt) if step.move else bank
+        sensor = model.moments("observation")
+        posterior = update(sensor, predicted, step.y, self.rule, step.missing, u=u, dt=dt).belief
+        x = posterior.sample(step.noise.proposal)
+        came = log_prob(model.conditional("transition", particles.x, u, dt), x) if step.move else bank.log_prob(x)
+        log_weight = log_likelihood(model, x, step) + came - posterior.log_prob(x)
         return Proposed(x, posterior.scale_tril, log_weight, posterior.space)
 
 

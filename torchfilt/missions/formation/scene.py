@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchfilt.filters.gaussian import UnscentedKalmanFilter
-from torchfilt.filters.particle import BootstrapFilter, ParticleFilter, UnscentedParticleFilter
+from torchfilt.filters.particle import ParticleFilter
+from torchfilt.filters.particle_methods import BootstrapFilter, UnscentedParticleFilter
 from torchfilt.gaussian import Gaussian
 from torchfilt.gp.frozen import FrozenGP
 from torchfilt.gp.transition import GPTransition

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchfilt.filters.gaussian import UnscentedKalmanFilter
-from torchfilt.filters.particle import UnscentedParticleFilter
+from torchfilt.filters.particle_methods import UnscentedParticleFilter
 from torchfilt.gaussian import Gaussian
 from torchfilt.missions.grace.data import GraceData
 from torchfilt.missions.grace.learning import J2, POTENTIAL, Dynamics

@@ -1,0 +1,98 @@
+"""The particle methods of the literature: each is the one loop with its own parts."""
+
+from torchfilt.filters.particle import ParticleFilter
+from torchfilt.kernels import Regularize
+from torchfilt.model import StateSpaceModel
+from torchfilt.moments import Rule, unscented
+from torchfilt.moves import MetropolisHastings
+from torchfilt.proposals import Local, LookAhead, Prior, Redraw, Weights
+from torchfilt.resampling import Resampler, ess_below, systematic
+
+
+def BootstrapFilter(
+    model: StateSpaceModel,
+    particles: int = 1000,
+    resampler: Resampler = systematic,
+    move: MetropolisHastings | None = None,
+    fast_normals: bool = False,
+) -> ParticleFilter:
+    """Particles moved by the transition law and weighted by the measurement.
+
+    Source: Gordon, Salmond, Smith, IEE Proceedings F 140 (1993).
+    """
+    return ParticleFilter(model, particles, Prior(), resampler, move, fast_normals)
+
+
+def UnscentedParticleFilter(
+    model: StateSpaceModel,
+    particles: int = 200,
+    rule: Rule | None = None,
+    split: float | None = 0.6,
+    redraw: Redraw = "always",
+    pooled: bool = True,
+    weights: Weights = "marginal",
+    resampler: Resampler | None = None,
+    move: MetropolisHastings | None = None,
+) -> ParticleFilter:
+    """An unscented Kalman filter for each particle, uncertainty shared between spread and local covariance.
+
+    The default keeps the fraction ``split`` of the cloud's covariance in each particle and moment-matches the redrawn
+    centres, which is what makes the method robust; ``pooled=False, split=0.0, weights="joint"`` is the proper
+    importance sampler of van der Merwe et al., ``split=None`` the literal form that keeps each P_i in full as well.
+
+    Sources: van der Merwe, Doucet, de Freitas, Wan, NIPS 13 (2000); Wei, Song, Zhang (2012), equation 7.
+    """
+    local = Local(rule or unscented(), redraw, split, pooled, weights)
+    return ParticleFilter(model, particles, local, resampler or ess_below(0.5), move)
+
+
+def LocallyLinearizedParticleFilter(
+    model: StateSpaceModel,
+    particles: int = 100,
+    rule: Rule | None = None,
+    split: float | None = 0.5,
+    redraw: Redraw = "never",
+    pooled: bool = False,
+    weights: Weights = "marginal",
+    resampler: Resampler | None = None,
+) -> ParticleFilter:
+    """A bank of Gaussian filters with weights: the same loop and proposal as the unscented particle filter.
+
+    Particles start as draws that hold the share 1 - split of the prior's covariance and are not redrawn, because
+    drawing from a covariance that is also kept counts it twice.
+    """
+    local = Local(rule or unscented(), redraw, split, pooled, weights)
+    return ParticleFilter(model, particles, local, resampler or ess_below(0.5))
+
+
+def AuxiliaryParticleFilter(
+    model: StateSpaceModel,
+    particles: int = 1000,
+    power: float = 1.0,
+    resampler: Resampler = systematic,
+    fast_normals: bool = False,
+) -> ParticleFilter:
+    """Particles are resampled by how well their predicted mean explains the measurement that comes next.
+
+    ``power`` below 1 flattens that look ahead: a sharp likelihood at a point says too much of a wide transition.
+
+    Source: Pitt and Shephard, Filtering via simulation: auxiliary particle filters, JASA 94 (1999).
+    """
+    return ParticleFilter(model, particles, Prior(), resampler, look_ahead=LookAhead(power), fast_normals=fast_normals)
+
+
+def RegularizedParticleFilter(
+    model: StateSpaceModel,
+    particles: int = 1000,
+    kernel: Regularize | None = None,
+    resampler: Resampler = systematic,
+    fast_normals: bool = False,
+) -> ParticleFilter:
+    """A bootstrap filter whose resampled particles are drawn anew from a kernel around each.
+
+    The default kernel keeps mean and covariance of the cloud, ``Regularize(keep_moments=False)`` is the plain one.
+
+    Source: Musso, Oudjane, Le Gland, Improving regularised particle filters (2001).
+    """
+    kernel = Regularize() if kernel is None else kernel
+    return ParticleFilter(model, particles, Prior(), resampler, kernel=kernel, fast_normals=fast_normals)
