@@ -13,6 +13,7 @@ import torchfilt as tf
 from torchfilt import moments, resampling
 from torchfilt.gp import GPTransition
 from torchfilt.gp.regression import GPRegression
+from torchfilt.kernels import Regularize
 from torchfilt.models import relative_motion
 from torchfilt.models.relative_motion import (
     BiasedRanging,
@@ -227,6 +228,8 @@ GAUSSIAN = {
     "UnscentedKalmanFilter": tf.UnscentedKalmanFilter,
     "UnscentedKalmanFilter iterated": lambda model: tf.UnscentedKalmanFilter(model, iterations=2),
     "CubatureKalmanFilter": tf.CubatureKalmanFilter,
+    "ErrorStateKalmanFilter": tf.ErrorStateKalmanFilter,
+    "ErrorStateKalmanFilter open loop": lambda model: tf.ErrorStateKalmanFilter(model, feedback=False),
     "GaussHermiteKalmanFilter": tf.GaussHermiteKalmanFilter,
 }
 JOINT = dict(redraw="always", split=0.0, pooled=False, weights="joint")
@@ -241,6 +244,11 @@ PARTICLE = {
     "Bootstrap moved, predictive": lambda m: tf.BootstrapFilter(
         m, 40, move=MetropolisHastings(1, 0.5, target="predictive")
     ),
+    "Regularized": lambda m: tf.RegularizedParticleFilter(m, 60),
+    "Regularized plain, adaptive": lambda m: tf.RegularizedParticleFilter(
+        m, 60, Regularize("epanechnikov", 0.3, keep_moments=False), ess_below(0.5)
+    ),
+    "Auxiliary": lambda m: tf.AuxiliaryParticleFilter(m, 40, 0.8, ess_below(0.9)),
     "UPF pooled": lambda m: tf.UnscentedParticleFilter(m, 20),
     "UPF joint": lambda m: tf.UnscentedParticleFilter(m, 20, **JOINT),
     "UPF joint, moved": lambda m: tf.UnscentedParticleFilter(m, 20, **JOINT, move=MetropolisHastings(1)),

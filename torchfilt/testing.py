@@ -512,6 +512,7 @@ def _noise_row(noise: StepNoise, k: int) -> StepNoise:
         redraw=first(noise.redraw),
         move_normal=second(noise.move_normal),
         move_uniform=second(noise.move_uniform),
+        kernel=first(noise.kernel),
     )
 
 
