@@ -339,13 +339,17 @@ def predict(law: Law, belief: Gaussian, rule: Rule, u: Tensor | None, dt: Tensor
 
 
 class Update(NamedTuple):
-    """What a measurement did: posterior, log-likelihood (...), innovation (..., e) and its factor, NIS (...)."""
+    """What a measurement did: posterior, log-likelihood (...), innovation (..., e) and its factor, NIS (...).
+
+    freedom: how many components were measured, (...), or one number for all.
+    """
 
     belief: Gaussian
     log_likelihood: Tensor
     innovation: Tensor
     innovation_scale_tril: Tensor
     nis: Tensor
+    freedom: Tensor | int
 
 
 def update(
@@ -431,7 +435,7 @@ def _condition(
         mean = torch.where(seen.unsqueeze(-1), mean, prior.mean)
         posterior_factor = torch.where(seen[..., None, None], posterior_factor, root)
     posterior = Gaussian(mean, posterior_factor, prior.space)
-    return Update(posterior, log_likelihood, innovation, innovation_factor, nis)
+    return Update(posterior, log_likelihood, innovation, innovation_factor, nis, counted)
 
 
 def _stack_rows(top: Tensor, root: Tensor) -> Tensor:

@@ -194,3 +194,52 @@ def test_linear_measurements_take_controls_by_their_matrix():
     one = tf.KalmanFilter(tf.StateSpaceModel(prior, walk, feed))(ys, us)
     other = tf.KalmanFilter(tf.StateSpaceModel(prior, walk, tf.LinearGaussian(eye, eye)))(ys - 3 * us)
     assert torch.allclose(one.mean, other.mean, rtol=0, atol=1e-14)
+
+
+def test_a_gate_shuts_out_what_does_not_fit():
+    """One row gets a wild measurement: it keeps its prediction to the bit, its neighbour is as without a gate."""
+    rng = np.random.default_rng(4)
+    us = tensor(rng.normal(0, 1, (40, 1)))
+    path = [tensor([0.1, 0.2])]
+    for u in us:
+        path.append(swing(path[-1], u, 0.05))
+    ys = torch.stack(path[1:])[:, :1].sin() + tensor(rng.normal(0, 0.02, (40, 1)))
+    ys, us = (part.unsqueeze(1).repeat(1, 2, 1) for part in (ys, us))
+    ys[20, 1] = 5.0
+    ys[30] = float("nan")
+    plain, gated = (tf.GaussianFilter(pendulum(), taylor(), gate=gate) for gate in (None, 0.9999))
+    free, shut = plain(ys, us, 0.05), gated(ys, us, 0.05)
+    accepted = shut.diagnostics.accepted
+    assert accepted.sum() == accepted.numel() - 1 and not accepted[20, 1] and free.diagnostics.accepted is None
+    assert torch.equal(shut.mean[:, 0], free.mean[:, 0]) and torch.equal(shut.mean[:20], free.mean[:20])
+    state = plain(ys[:20], us[:20], 0.05).final
+    ahead = plain.predict(state.belief, us[20], 0.05)
+    assert torch.equal(shut.mean[20, 1], ahead.mean[1])
+    assert torch.equal(shut.covariance[20, 1], (ahead.scale_tril @ ahead.scale_tril.mT)[1])
+    assert shut.evidence == "approximate" and free.evidence == "linearized"
+    assert (shut.log_likelihood[1] - free.log_likelihood[1]) > 100
+
+
+def test_the_gate_has_the_stated_rate():
+    """Of 60,000 right measurements of two components, one missing now and then, 1 % are shut out: 4.5 deviations."""
+    from scipy import stats
+
+    eye = torch.eye(2, dtype=F64)
+    model = tf.StateSpaceModel(
+        tf.Gaussian(torch.zeros(2, dtype=F64), eye), tf.LinearGaussian(eye, eye), tf.LinearGaussian(eye, 2 * eye)
+    )
+    generator = torch.Generator().manual_seed(3)
+    ys = 2 * torch.randn(1, 60_000, 2, generator=generator, dtype=F64)  # prior 1, step 1, noise 2: variance 4
+    ys[0, ::3, 1] = float("nan")
+    history = tf.GaussianFilter(model, taylor(), gate=0.99)(ys)
+    rejected = int((~history.diagnostics.accepted).sum())
+    assert stats.binomtest(rejected, 60_000, 0.01).pvalue > 1e-5
+    nis, one = history.diagnostics.nis[0], torch.arange(60_000) % 3 == 0
+    for rows, freedom in ((one, 1), (~one, 2)):
+        assert torch.equal(history.diagnostics.accepted[0, rows], nis[rows] <= stats.chi2.ppf(0.99, freedom))
+
+
+@pytest.mark.parametrize("gate", [0.0, 1.0, float("nan")])
+def test_a_gate_is_a_probability(gate):
+    with pytest.raises(ValueError, match=r"gate must be a probability in \(0, 1\) or None"):
+        tf.ErrorStateKalmanFilter(pendulum(), gate=gate)

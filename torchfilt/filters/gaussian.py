@@ -1,5 +1,6 @@
 """Gaussian filters: one square-root recursion, one moment rule; the named methods differ by the rule."""
 
+import torch
 from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
@@ -30,20 +31,26 @@ class GaussianFilter(Filter[Gaussian]):
         model: the three laws; laws that are not Gaussian enter by their first two moments.
         rule: how moments go through a law: `taylor()`, `unscented()`, `cubature()`, `gauss_hermite()`.
         iterations: linearisations of the measurement law, each about the posterior of the one before.
+        gate: probability with which a measurement that fits is taken in, such as 0.999; the others, by the chi-square
+            test of their innovation, are treated as not measured and reported in ``info.accepted``. None takes all.
 
     Raises:
-        ValueError: iterations below 1. TypeError: not a model, not a moment rule.
+        ValueError: iterations below 1, gate outside (0, 1). TypeError: not a model, not a moment rule.
     """
 
     carries = Gaussian
 
-    def __init__(self, model: StateSpaceModel, rule: Rule, iterations: int = 1) -> None:
+    def __init__(self, model: StateSpaceModel, rule: Rule, iterations: int = 1, gate: float | None = None) -> None:
         super().__init__(model)
         check_rule_type(rule)
         if iterations < 1:
             raise ValueError(f"iterations must be at least 1, got {iterations}")
-        self.rule, self.iterations = rule, iterations
+        if gate is not None and not 0 < gate < 1:
+            raise ValueError(f"gate must be a probability in (0, 1) or None, got {gate}")
+        self.rule, self.iterations, self.gate = rule, iterations, gate
         self.evidence = "exact" if model.is_linear() else "linearized"
+        if gate is not None:
+            self.evidence = "approximate"  # what was shut out is not in it
 
     def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[Gaussian]:
         """The prior's moments, the mean expanded to (*batch, d); ``seed`` is carried along unused.
@@ -79,6 +86,9 @@ class GaussianFilter(Filter[Gaussian]):
         if predict:
             belief = self.predict(belief, u, dt)
         result = self.update(belief, y, missing, u, dt)
+        accepted = None
+        if self.gate is not None:
+            result, accepted = _shut_out(result, belief, 1 - self.gate)
         posterior = result.belief
         # A factor made by a triangularisation cannot lose definiteness but by NaN; a failed downdate is NaN as well.
         # NaN and infinity survive a sum, and only what is neither leaves nothing when it is taken from itself.
@@ -90,9 +100,22 @@ class GaussianFilter(Filter[Gaussian]):
             result.innovation,
             result.innovation_scale_tril,
             result.nis,
+            accepted=accepted,
             evidence=self.evidence,
         )
         return posterior, info
+
+
+def _shut_out(result: Update, prior: Gaussian, level: float) -> tuple[Update, Tensor]:
+    """The prior again in rows whose innovation has a probability below ``level``; with which rows were taken in."""
+    freedom = torch.as_tensor(result.freedom, dtype=result.nis.dtype, device=result.nis.device)
+    chance = torch.special.gammaincc(freedom.clamp_min(1) / 2, result.nis / 2)
+    accepted = ~(chance < level)  # a failed row, NaN, stays what it is
+    after = result.belief
+    mean = torch.where(accepted.unsqueeze(-1), after.mean, prior.mean)
+    factor = torch.where(accepted[..., None, None], after.scale_tril, prior.factor())
+    log_likelihood = torch.where(accepted, result.log_likelihood, 0)
+    return result._replace(belief=Gaussian(mean, factor, after.space), log_likelihood=log_likelihood), accepted
 
 
 def KalmanFilter(model: StateSpaceModel) -> GaussianFilter:
@@ -122,7 +145,9 @@ def ExtendedKalmanFilter(model: StateSpaceModel, iterations: int = 1) -> Gaussia
     return GaussianFilter(model, taylor(), iterations)
 
 
-def ErrorStateKalmanFilter(model: StateSpaceModel, feedback: bool = True, iterations: int = 1) -> GaussianFilter:
+def ErrorStateKalmanFilter(
+    model: StateSpaceModel, feedback: bool = True, iterations: int = 1, gate: float | None = None
+) -> GaussianFilter:
     """The indirect form: a reference that moves by the full law, and a Gaussian over its error in the tangent space.
 
     On a space the recursion is just that: the mean is the reference, the factor belongs to the error, ``retract`` feeds
@@ -135,6 +160,7 @@ def ErrorStateKalmanFilter(model: StateSpaceModel, feedback: bool = True, iterat
         model: the three laws; the prior's mean is the reference's start.
         feedback: see above.
         iterations: linearisations of the measurement law, as in `ExtendedKalmanFilter`; with feedback only.
+        gate: as in `GaussianFilter`.
 
     Raises:
         ValueError: iterations above 1 or a prior with a batch of its own, without feedback.
@@ -143,14 +169,14 @@ def ErrorStateKalmanFilter(model: StateSpaceModel, feedback: bool = True, iterat
         filtering, JGCD 26 (2003).
     """
     if feedback:
-        return GaussianFilter(model, taylor(), iterations)
+        return GaussianFilter(model, taylor(), iterations, gate)
     check_model(model)
     if iterations != 1:
         raise ValueError(f"without feedback the law is linearised once: iterations must be 1, got {iterations}")
     mean = model.prior().mean
     if mean.dim() != 1:
         raise ValueError(f"without feedback the prior's mean must be one point for all rows, got {tuple(mean.shape)}")
-    return GaussianFilter(model, taylor(mean))
+    return GaussianFilter(model, taylor(mean), gate=gate)
 
 
 def UnscentedKalmanFilter(
