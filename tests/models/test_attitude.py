@@ -112,6 +112,25 @@ def test_skew_is_the_cross_product():
     assert torch.equal(attitude.skew(a), -attitude.skew(a).mT)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-8, 1e-2, 0.499, 0.501, 2.0, 6.0])
+def test_mean_rotation_is_the_mean_of_the_rotations(size):
+    """Gauss's quadrature of SciPy's matrices; 0.5 rad is where a series takes over."""
+    v = size * (V / V.norm(dim=-1, keepdim=True))[:10].numpy()
+    points, weights = np.polynomial.legendre.leggauss(24)
+    turns = [w / 2 * Rotation.from_rotvec((p + 1) / 2 * v).as_matrix() for p, w in zip(points, weights, strict=True)]
+    same(attitude.mean_rotation(torch.from_numpy(v)), sum(turns))
+
+
+def test_mean_rotation_is_the_left_jacobian_of_the_exponential():
+    def turned(d):
+        return attitude.to_rotation_vector(
+            attitude.multiply(attitude.from_rotation_vector(V[0] + d), attitude.from_rotation_vector(-V[0]))
+        )
+
+    jacobian = torch.func.jacfwd(turned)(torch.zeros(3, dtype=DOUBLE))
+    same(attitude.mean_rotation(V[0]), jacobian, size=4)
+
+
 def test_attitudes_of_north_east_down():
     """Aircraft convention: yaw about down, pitch about right, roll about forward, in this order (z, y, x)."""
     heading, pitch, roll = angles()
@@ -138,6 +157,7 @@ FUNCTIONS = {
     "from_euler": (attitude.from_euler, angles(4)),
     "to_euler": (attitude.to_euler, (A[:4],)),
     "skew": (attitude.skew, (V[:4],)),
+    "mean_rotation": (attitude.mean_rotation, (torch.cat([0.1 * V[:2], V[2:4]]),)),
     "ned_frd_to_enu_rfu": (attitude.ned_frd_to_enu_rfu, (A[:4],)),
     "swap_enu_ned": (attitude.swap_enu_ned, (V[:4],)),
     "swap_rfu_frd": (attitude.swap_rfu_frd, (V[:4],)),
@@ -145,7 +165,8 @@ FUNCTIONS = {
 
 
 def test_every_function_is_in_the_table():
-    public = {n for n, f in vars(attitude).items() if callable(f) and getattr(f, "__module__", "") == attitude.__name__}
+    own = {n: f for n, f in vars(attitude).items() if getattr(f, "__module__", "") == attitude.__name__}
+    public = {n for n in own if not n.startswith("_")}
     assert public == set(FUNCTIONS)
 
 

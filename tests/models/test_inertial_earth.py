@@ -65,6 +65,15 @@ def test_gravity_leaves_out_the_third_order_in_height():
     assert math.log2(error(2e5) / error(1e5)) == pytest.approx(3, abs=0.3)
 
 
+def test_slopes_are_the_derivatives():
+    lat, height = LAT, 1e3 * LON
+    one, zero = torch.ones_like(lat), torch.zeros_like(lat)
+    by_latitude = torch.func.jvp(earth.radii, (lat,), (one,))[1]
+    gravity = [torch.func.jvp(earth.gravity, (lat, height), way)[1] for way in ((one, zero), (zero, one))]
+    for found, expected in zip(earth.slopes(lat, height), (*by_latitude, *gravity), strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-14 * expected.abs().max().item())
+
+
 def test_horizontal_gravity_that_is_left_out_is_as_small_as_stated():
     south = [abs(oracle.gravity(v, 6e3)[1]) for v in LAT]
     assert 4e-5 < max(south) < 5e-5
@@ -154,6 +163,7 @@ def test_axes_are_those_of_pymap3d():
 FUNCTIONS = {
     "radii": (earth.radii, (LAT[:5],)),
     "gravity": (earth.gravity, (LAT[:5], HEIGHT[:5])),
+    "slopes": (earth.slopes, (LAT[:5], HEIGHT[:5])),
     "earth_rate_enu": (earth.earth_rate_enu, (LAT[:5],)),
     "transport_rate_enu": (earth.transport_rate_enu, (LAT[:5], HEIGHT[:5], torch.ones(5, 3, dtype=DOUBLE))),
     "geodetic_to_ecef": (earth.geodetic_to_ecef, (LAT[:5], LON[:5], HEIGHT[:5])),

@@ -56,6 +56,8 @@ WGS84 = Ellipsoid(
     gravity_equator_m_s2=9.7803253359,
     gravity_pole_m_s2=9.8321849378,
 )
+# k of Somigliana's formula.
+_SOMIGLIANA = (1 - WGS84.flattening) * WGS84.gravity_pole_m_s2 / WGS84.gravity_equator_m_s2 - 1
 
 
 def radii(latitude_rad: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,10 +78,29 @@ def gravity(latitude_rad: Tensor, height_m: Tensor) -> Tensor:
     """
     sin2 = latitude_rad.sin().square()
     a, f = WGS84.semi_major_m, WGS84.flattening
-    k = (1 - f) * WGS84.gravity_pole_m_s2 / WGS84.gravity_equator_m_s2 - 1
-    surface = WGS84.gravity_equator_m_s2 * (1 + k * sin2) / (1 - WGS84.eccentricity2 * sin2).sqrt()
+    surface = WGS84.gravity_equator_m_s2 * (1 + _SOMIGLIANA * sin2) / (1 - WGS84.eccentricity2 * sin2).sqrt()
     ratio = height_m / a
     return surface * (1 - 2 * (1 + f + WGS84.centrifugal_ratio - 2 * f * sin2) * ratio + 3 * ratio.square())
+
+
+def slopes(latitude_rad: Tensor, height_m: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Derivatives of the meridian and transverse radii by latitude (m/rad), of gravity by latitude and by height.
+
+    Each (...); what automatic differentiation of `radii` and `gravity` gives, at a fraction of its price.
+    """
+    a, f, e2 = WGS84.semi_major_m, WGS84.flattening, WGS84.eccentricity2
+    sine = latitude_rad.sin()
+    sin2, half_double = sine.square(), sine * latitude_rad.cos()
+    w2 = 1 - e2 * sin2
+    transverse = a / w2.sqrt()
+    transverse_slope = e2 * transverse * half_double / w2
+    meridian_slope = 3 * (1 - e2) * transverse_slope / w2
+    surface = WGS84.gravity_equator_m_s2 / a * transverse * (1 + _SOMIGLIANA * sin2)
+    surface_slope = 2 * surface * half_double * (_SOMIGLIANA / (1 + _SOMIGLIANA * sin2) + e2 / (2 * w2))
+    ratio = height_m / a
+    falls = 2 * (1 + f + WGS84.centrifugal_ratio - 2 * f * sin2)
+    by_latitude = surface_slope * (1 - falls * ratio + 3 * ratio.square()) + surface * 8 * f * half_double * ratio
+    return meridian_slope, transverse_slope, by_latitude, surface / a * (6 * ratio - falls)
 
 
 def earth_rate_enu(latitude_rad: Tensor) -> Tensor:
