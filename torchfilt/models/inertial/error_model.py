@@ -151,7 +151,8 @@ def sins_inputs(
         dtheta_rad, dvelocity_m_s: IMU increments (t * samples, *batch, 3).
         interval_s: time of an increment.
         samples: increments in a step of the filter.
-        group: increments in a step of the mechanisation; they are joined with coning and sculling terms.
+        group: increments in a step of the mechanisation, see `strapdown.increments`; an odd one joins them without
+            coning and sculling terms.
 
     Raises:
         ValueError: increments that do not fill whole steps, a group that does not divide a step.
@@ -202,7 +203,8 @@ class InertialErrorTransition(nn.Module):
 
     Exact in the attitude error; the Earth's terms are taken at the middle of the step. White noise of gyros and
     accelerometers reaches attitude and velocity only, so that the noise has rank 6 of 15. Both are alike in all
-    directions, hence it does not matter through which attitude they enter.
+    directions, hence it does not matter through which attitude they enter. Noise of the gyros reaches the velocity with
+    the next step only.
 
     Args:
         origin: where the metres of the position are counted from.

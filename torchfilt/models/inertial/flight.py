@@ -142,6 +142,7 @@ def fly(plan: FlightPlan, time_s: Tensor) -> Flight:
         ValueError: times that are not one increasing row inside the flight.
     """
     _check_times(plan, time_s)
+    time_s = time_s.contiguous()
     knots = _knots(plan, time_s)
     points, weights, inside = _gauss_legendre()
     length = knots.diff()
