@@ -187,6 +187,19 @@ def test_magnetometer_sees_the_field_of_the_place(log):
     assert difference.std() == pytest.approx(7.8, abs=0.3)
 
 
+def test_magnetometer_is_right_on_the_ground_and_the_reference_is_not(log):
+    """Taxiing at 2.5 to 3 m/s, 190 s: the course is the heading."""
+    fix = (log.gnss.time_s > 189.5) & (log.gnss.time_s < 191)
+    at = torch.searchsorted(log.time_s, log.gnss.time_s[fix])
+    east, north, _ = log.gnss.velocity_m_s[fix].numpy().T
+    assert len(at) == 2 and np.hypot(east, north).min() > 2.4
+    course = np.arctan2(east, north)
+    pitch, roll = log.reference.pitch_rad[at + 1], log.reference.roll_rad[at + 1]
+    level = Rotation.from_euler("XY", torch.stack([pitch, roll], -1)).apply(log.magnetic_field_tesla[at])
+    assert np.abs(turned(np.arctan2(-level[:, 0], level[:, 1]) - course)).max() < 15
+    assert np.abs(turned(log.reference.heading_rad[at + 1].numpy() - course)).min() > 30
+
+
 def test_fixes_reference_and_barometer_agree(log):
     """On-board minus GPS height and barometer minus GPS height at the fixes' times."""
     fix = log.gnss
