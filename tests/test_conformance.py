@@ -15,6 +15,12 @@ from torchfilt.gp import GPTransition
 from torchfilt.gp.regression import GPRegression
 from torchfilt.kernels import Regularize
 from torchfilt.models import relative_motion
+from torchfilt.models.inertial import error_model
+from torchfilt.models.inertial.earth import LocalMetres
+from torchfilt.models.inertial.error_model import InertialErrorFixes, InertialErrorTransition
+from torchfilt.models.inertial.flight import fly, reconnaissance
+from torchfilt.models.inertial.imu import MEMS, MEMS_START
+from torchfilt.models.inertial.strapdown import Navigation
 from torchfilt.models.relative_motion import (
     BiasedRanging,
     ClohessyWiltshire,
@@ -53,6 +59,16 @@ CONTROLS = chief_controls(CHIEF)
 RADIUS = torch.linalg.vector_norm(CHIEF.position_m[0])
 NEAR = RELATIVE[0] + normal(5, 6, seed=1) * torch.tensor([20.0, 20, 20, 0.02, 0.02, 0.02]).double()
 BIASED = torch.cat([NEAR, normal(5, 1, seed=2)], -1)
+
+ORIGIN = LocalMetres(0.6, 1.9, 2000.0)
+FLOWN = fly(reconnaissance(), 100 + 0.01 * torch.arange(101, dtype=DOUBLE))
+SINS_ERRORS = error_model.start_law(MEMS_START, MEMS).sample(normal(5, 15, seed=12))
+SINS = error_model.sins_inputs(
+    error_model.add_error(Navigation(*(part[0] for part in FLOWN.navigation)), SINS_ERRORS, ORIGIN),
+    FLOWN.dtheta_rad.unsqueeze(1),
+    FLOWN.dvelocity_m_s.unsqueeze(1),
+    0.01,
+).u[0]
 
 
 def swing(x, u=None, dt=None):
@@ -117,6 +133,15 @@ LAWS = {
     ),
     "RendezvousRadar": (RendezvousRadar(RADIUS), NEAR, None, None),
     "BiasedRanging": (BiasedRanging(RADIUS, 0.01, 1e-3, 1e-3), BIASED, None, None),
+    "InertialErrorTransition": (InertialErrorTransition(ORIGIN, 1e-4, 1e-3), SINS_ERRORS, SINS, 1.0),
+    "InertialErrorTransition dt a row": (
+        InertialErrorTransition(ORIGIN, 1e-4, 1e-3),
+        SINS_ERRORS,
+        SINS[0],
+        torch.tensor([[1.0], [0.5], [2.0], [0.1], [1.0]], dtype=DOUBLE),
+    ),
+    "InertialErrorFixes": (InertialErrorFixes(1e-3, 10.0, 10.0), SINS_ERRORS, SINS, None),
+    "InertialErrorFixes outliers": (InertialErrorFixes(1e-3, 10.0, 10.0, 0.15), SINS_ERRORS, SINS, None),
     "GPTransition identity": (learned(), NEAR, None, None),
     "GPTransition next state": (learned("next_state", noise="latent"), NEAR, None, 10.0),
     "GPTransition residual": (learned("residual", ClohessyWiltshire(1.1e-3, 1e-9)), NEAR, None, 10.0),
@@ -143,7 +168,7 @@ def test_every_law_is_registered():
     laws = {type(law).__name__ for law, *_ in LAWS.values()}
     shipped = {
         name
-        for module in (tf.laws, relative_motion, tf.gp)
+        for module in (tf.laws, relative_motion, error_model, tf.gp)
         for name, member in inspect.getmembers(module, inspect.isclass)
         if issubclass(member, nn.Module)
         and inspect.signature(member.forward).return_annotation in (tf.Gaussian, "Gaussian")

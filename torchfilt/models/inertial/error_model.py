@@ -201,10 +201,12 @@ def _without_force(navigation: Navigation) -> Tensor:
 class InertialErrorTransition(nn.Module):
     """Motion of the error state over a step; u as made by `sins_inputs`, dt its length in s.
 
-    Exact in the attitude error; the Earth's terms are taken at the middle of the step. White noise of gyros and
-    accelerometers reaches attitude and velocity only, so that the noise has rank 6 of 15. Both are alike in all
-    directions, hence it does not matter through which attitude they enter. Noise of the gyros reaches the velocity with
-    the next step only.
+    Exact in the attitude error. The Earth's terms are those of the middle of the step, and the force counts as even
+    over it: in a manoeuvre the position lags by dt^2 / 12 of the error's acceleration.
+
+    White noise of gyros and accelerometers reaches attitude and velocity only, so that the noise has rank 6 of 15; what
+    the gyros' noise of a step does to the velocity in the same step is left to the next one. Both are alike in all
+    directions, hence it does not matter through which attitude they enter.
 
     Args:
         origin: where the metres of the position are counted from.
