@@ -422,7 +422,7 @@ def test_slopes_are_the_derivatives_of_a_step():
 
     for k in range(6):
         at = (slopes.force[k], nav.velocity[k], nav.latitude[k], nav.height[k])
-        torch.testing.assert_close(step(*at)[0], slopes.rotation[k], rtol=1e-10, atol=0)
+        torch.testing.assert_close(step(*at)[0], slopes.enu_turn[k], rtol=1e-10, atol=0)
         jacobians = torch.func.jacfwd(step, (0, 1, 2, 3))(*at)
         for name, (force, velocity, latitude, height) in zip(("turn", "velocity", "position"), jacobians, strict=True):
             expected = torch.cat([force, velocity, latitude.unsqueeze(-1), height.unsqueeze(-1)], -1)

@@ -132,7 +132,7 @@ def mean_rotation(v: Tensor) -> Tensor:
 def _series(s: Tensor, start: int) -> Tensor:
     """Sum of (-s)^k / (2 k + start)! for s up to 0.25."""
     total = torch.zeros_like(s)
-    for k in range(6, -1, -1):
+    for k in range(5, -1, -1):
         total = 1 / math.factorial(2 * k + start) - s * total
     return total
 

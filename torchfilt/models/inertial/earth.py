@@ -83,24 +83,32 @@ def gravity(latitude_rad: Tensor, height_m: Tensor) -> Tensor:
     return surface * (1 - 2 * (1 + f + WGS84.centrifugal_ratio - 2 * f * sin2) * ratio + 3 * ratio.square())
 
 
-def slopes(latitude_rad: Tensor, height_m: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Derivatives of the meridian and transverse radii by latitude (m/rad), of gravity by latitude and by height.
+def radii_slopes(latitude_rad: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of both `radii` by latitude, each (...), m/rad."""
+    e2 = WGS84.eccentricity2
+    sine = latitude_rad.sin()
+    w2 = 1 - e2 * sine.square()
+    transverse = e2 * WGS84.semi_major_m * sine * latitude_rad.cos() * w2**-1.5
+    return 3 * (1 - e2) * transverse / w2, transverse
 
-    Each (...); what automatic differentiation of `radii` and `gravity` gives, at a fraction of its price.
-    """
+
+def gravity_slopes(latitude_rad: Tensor, height_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of `gravity` by latitude (m/s^2/rad) and by height (1/s^2), each (...)."""
     a, f, e2 = WGS84.semi_major_m, WGS84.flattening, WGS84.eccentricity2
     sine = latitude_rad.sin()
-    sin2, half_double = sine.square(), sine * latitude_rad.cos()
-    w2 = 1 - e2 * sin2
-    transverse = a / w2.sqrt()
-    transverse_slope = e2 * transverse * half_double / w2
-    meridian_slope = 3 * (1 - e2) * transverse_slope / w2
-    surface = WGS84.gravity_equator_m_s2 / a * transverse * (1 + _SOMIGLIANA * sin2)
-    surface_slope = 2 * surface * half_double * (_SOMIGLIANA / (1 + _SOMIGLIANA * sin2) + e2 / (2 * w2))
+    sin2, double = sine.square(), 2 * sine * latitude_rad.cos()
+    w2, grown = 1 - e2 * sin2, 1 + _SOMIGLIANA * sin2
+    surface = WGS84.gravity_equator_m_s2 * grown / w2.sqrt()
+    surface_slope = surface * double * (_SOMIGLIANA / grown + e2 / (2 * w2))
     ratio = height_m / a
-    falls = 2 * (1 + f + WGS84.centrifugal_ratio - 2 * f * sin2)
-    by_latitude = surface_slope * (1 - falls * ratio + 3 * ratio.square()) + surface * 8 * f * half_double * ratio
-    return meridian_slope, transverse_slope, by_latitude, surface / a * (6 * ratio - falls)
+    falls = 2 * (1 + f + WGS84.centrifugal_ratio) - 4 * f * sin2
+    by_latitude = surface_slope * (1 - falls * ratio + 3 * ratio.square()) + surface * double * ratio * (4 * f)
+    return by_latitude, surface * (6 * ratio - falls) / a
+
+
+def slopes(latitude_rad: Tensor, height_m: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`radii_slopes` and `gravity_slopes`: automatic differentiation at a fraction of its price."""
+    return (*radii_slopes(latitude_rad), *gravity_slopes(latitude_rad, height_m))
 
 
 def earth_rate_enu(latitude_rad: Tensor) -> Tensor:

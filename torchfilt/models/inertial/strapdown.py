@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchfilt.models.attitude import from_rotation_vector, mean_rotation, multiply, rotate, skew, to_rotation_vector
-from torchfilt.models.inertial.earth import WGS84, gravity, radii, slopes
+from torchfilt.models.attitude import from_rotation_vector, mean_rotation, multiply, rotate, to_rotation_vector
+from torchfilt.models.inertial.earth import WGS84, gravity, radii, radii_slopes, slopes
 
 _LARGEST_FIT = 4
 
@@ -273,15 +273,16 @@ def navigate(start: Navigation, dtheta: Tensor, dv: Tensor, dt: Tensor | float) 
 class AdvanceSlopes(NamedTuple):
     """Derivatives of one step by (dv in ENU axes, velocity, latitude, height), the eight columns of each.
 
-    turn (..., 3, 8) of the navigation axes' turn, velocity (..., 3, 8) of the velocity at the end, position (..., 3, 8)
-    of the changes of longitude, latitude and height; force (..., 3) is the increment in ENU axes at the start.
+    turn (..., 3, 8) of the ENU axes' turn, velocity (..., 3, 8) of the velocity at the end, position (..., 3, 8) of the
+    changes of longitude, latitude and height. Beside them two values: force (..., 3), the increment in ENU axes at the
+    start, and enu_turn (..., 3), the turn of these axes in rad.
     """
 
     turn: Tensor
     velocity: Tensor
     position: Tensor
     force: Tensor
-    rotation: Tensor
+    enu_turn: Tensor
 
 
 def advance_slopes(
@@ -298,58 +299,54 @@ def advance_slopes(
     result = _advance(quaternion, velocity, mid, dtheta, dt)
     step = mid.step
     span = dt.unsqueeze(-1) if isinstance(dt, Tensor) and dt.dim() > 0 else dt  # beside matrices
-    x, y, sine, cosine = mid.by_meridian, mid.by_transverse, mid.sine, mid.cosine
-    zero, one = torch.zeros_like(sine), torch.ones_like(sine)
-    unit = torch.eye(8, dtype=velocity.dtype, device=velocity.device)
-    d_force, d_velocity = unit[:3], unit[3:6]
+    zero, one = torch.zeros_like(mid.sine), torch.ones_like(mid.sine)
+    d_force, d_velocity = torch.eye(6, 8, dtype=velocity.dtype, device=velocity.device).split(3)
     # Latitude and height of the middle, rows (..., 8).
-    first_slope = slopes(latitude, height)[0]
-    lead = step / 2 * velocity[..., 1] / mid.first_meridian.square()
-    d_latitude = torch.stack(
-        [zero, zero, zero, zero, step / 2 / mid.first_meridian + zero, zero, 1 - lead * first_slope, -lead], -1
-    )
+    by_meridian = step / 2 / mid.first_meridian + zero
+    lead = by_meridian * velocity[..., 1] / mid.first_meridian
+    curved = 1 - lead * radii_slopes(latitude)[0]
+    d_latitude = torch.stack([zero, zero, zero, zero, by_meridian, zero, curved, -lead], -1)
     d_height = torch.stack([zero, zero, zero, zero, zero, step / 2 + zero, zero, one], -1)
-    meridian, transverse, gravity_latitude, gravity_height = slopes(mid.latitude, mid.height)
-    # 1 / (M + h) and 1 / (N + h), their slopes.
-    d_x = -x.square().unsqueeze(-1) * (meridian.unsqueeze(-1) * d_latitude + d_height)
-    d_y = -y.square().unsqueeze(-1) * (transverse.unsqueeze(-1) * d_latitude + d_height)
-    d_tangent = d_latitude / cosine.square().unsqueeze(-1)
-    tangent = (sine / cosine).unsqueeze(-1)
-    d_scale = torch.stack([-d_x, d_y, d_y * tangent + y.unsqueeze(-1) * d_tangent], -2)
-    d_earth = WGS84.rate_rad_s * torch.stack([zero, -sine, cosine], -1).unsqueeze(-1) * d_latitude.unsqueeze(-2)
-    d_gravity = gravity_latitude.unsqueeze(-1) * d_latitude + gravity_height.unsqueeze(-1) * d_height
-    d_weight = pad(d_gravity.unsqueeze(-2), (0, 0, 2, 0)) * span
+    meridian, transverse, gravity_latitude, gravity_height = (
+        value.unsqueeze(-1) for value in slopes(mid.latitude, mid.height)
+    )
+    x, y, sine, cosine = (value.unsqueeze(-1) for value in (mid.by_meridian, mid.by_transverse, mid.sine, mid.cosine))
+    # 1 / (M + h), 1 / (N + h) and what becomes of them in the transport rate.
+    d_x = -x.square() * (meridian * d_latitude + d_height)
+    d_y = -y.square() * (transverse * d_latitude + d_height)
+    tangent, d_tangent = sine / cosine, d_latitude / cosine.square()
+    d_scale = torch.stack([-d_x, d_y, d_y * tangent + y * d_tangent], -2)
+    axis = torch.cat([torch.zeros_like(sine), -sine, cosine], -1)
+    d_earth = (WGS84.rate_rad_s * axis * dt).unsqueeze(-1) * d_latitude.unsqueeze(-2)
+    d_gravity = gravity_latitude * d_latitude + gravity_height * d_height
+    d_push = d_force - pad(d_gravity.unsqueeze(-2), (0, 0, 2, 0)) * span
 
-    def d_transport(v: Tensor, d_v: Tensor) -> Tensor:
-        east, north, _ = v.unbind(-1)
-        d_east, d_north = d_v[..., 0, :], d_v[..., 1, :]
+    def d_turn(v: Tensor, d_v: Tensor) -> Tensor:
+        """Of (Earth's and transport rate of the velocity v) dt."""
+        east, north, d_east, d_north = v[..., 0], v[..., 1], d_v[..., 0, :], d_v[..., 1, :]
         moved = mid.scale.unsqueeze(-1) * torch.stack([d_north, d_east, d_east], -2)
-        return moved + d_scale * torch.stack([north, east, east], -1).unsqueeze(-1)
+        return d_earth + (moved + d_scale * torch.stack([north, east, east], -1).unsqueeze(-1)) * span
 
     def d_change(turn: Tensor, d_turn: Tensor, v: Tensor, d_v: Tensor) -> Tensor:
-        turned = (skew(turn) @ d_force - skew(mid.force) @ d_turn) / 2
-        coriolis = skew(earth + turn) @ d_v - skew(v) @ (d_earth * span + d_turn)
-        return d_force - turned - d_weight - coriolis
+        """Of `_change`."""
+        turned = (_cross_columns(turn, d_force) - _cross_columns(mid.force, d_turn)) / 2
+        return d_push - turned - _cross_columns(earth + turn, d_v) + _cross_columns(v, d_earth + d_turn)
 
     turn, earth = mid.rate * dt, mid.earth * dt
-    d_first_turn = (d_earth + d_transport(velocity, d_velocity)) * span
-    d_middle = d_velocity + d_change(mid.first_rate * dt, d_first_turn, velocity, d_velocity) / 2
-    d_turn = (d_earth + d_transport(mid.velocity, d_middle)) * span
-    d_end = d_velocity + d_change(turn, d_turn, mid.velocity, d_middle)
-    d_mean, mean = (d_velocity + d_end) / 2, (velocity + result.velocity) / 2
-    d_east, d_north, d_up = d_mean.unbind(-2)
-    east, north = mean[..., :1], mean[..., 1:2]
-    by_cosine = 1 / cosine.unsqueeze(-1)
-    across = (d_y + (y.unsqueeze(-1) * tangent) * d_latitude) * by_cosine
-    d_position = torch.stack(
-        [
-            (y.unsqueeze(-1) * by_cosine) * d_east + east * across,
-            x.unsqueeze(-1) * d_north + north * d_x,
-            d_up,
-        ],
-        -2,
-    )
-    return result, AdvanceSlopes(d_turn, d_end, d_position * span, mid.force, turn)
+    first = d_turn(velocity, d_velocity)
+    d_middle = d_velocity + d_change(mid.first_rate * dt, first, velocity, d_velocity) / 2
+    last = d_turn(mid.velocity, d_middle)
+    d_end = d_velocity + d_change(turn, last, mid.velocity, d_middle)
+    d_east, d_north, d_up = ((d_velocity + d_end) / 2).unbind(-2)
+    east, north, _ = ((velocity + result.velocity) / 2).split(1, -1)
+    longitude = (y * d_east + east * (d_y + y * tangent * d_latitude)) / cosine
+    d_position = torch.stack([longitude, x * d_north + north * d_x, d_up], -2) * span
+    return result, AdvanceSlopes(last, d_end, d_position, mid.force, turn)
+
+
+def _cross_columns(a: Tensor, columns: Tensor) -> Tensor:
+    """Vector (..., 3) cross each column (..., 3, k)."""
+    return torch.linalg.cross(*torch.broadcast_tensors(a.unsqueeze(-1), columns), dim=-2)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
