@@ -15,12 +15,13 @@ from torchfilt.gp import GPTransition
 from torchfilt.gp.regression import GPRegression
 from torchfilt.kernels import Regularize
 from torchfilt.models import relative_motion
-from torchfilt.models.inertial import error_model
+from torchfilt.models.inertial import error_model, navigation
 from torchfilt.models.inertial.earth import LocalMetres
 from torchfilt.models.inertial.error_model import InertialErrorFixes, InertialErrorTransition
 from torchfilt.models.inertial.flight import fly, reconnaissance
 from torchfilt.models.inertial.imu import MEMS, MEMS_START
-from torchfilt.models.inertial.strapdown import Navigation
+from torchfilt.models.inertial.navigation import NavigationFixes, StrapdownTransition
+from torchfilt.models.inertial.strapdown import Navigation, increments
 from torchfilt.models.relative_motion import (
     BiasedRanging,
     ClohessyWiltshire,
@@ -69,6 +70,17 @@ SINS = error_model.sins_inputs(
     FLOWN.dvelocity_m_s.unsqueeze(1),
     0.01,
 ).u[0]
+STATES = navigation.NAVIGATION_SPACE.retract(
+    navigation.navigation_state(Navigation(*(part[0] for part in FLOWN.navigation)), ORIGIN),
+    normal(5, 15, seed=15) * torch.tensor([0.1, 1.0, 100.0, 1e-3, 1e-2], dtype=DOUBLE).repeat_interleave(3),
+)
+INCREMENTS = torch.cat(increments(FLOWN.dtheta_rad / 0.01, FLOWN.dvelocity_m_s / 0.01, 0.01, 20), -1)
+IMU_WALKS = dict(
+    angle_random_walk_rad_sqrt_s=1e-4,
+    velocity_random_walk_m_s_sqrt_s=1e-3,
+    gyro_bias_walk_rad_s_sqrt_s=1e-6,
+    accel_bias_walk_m_s2_sqrt_s=1e-5,
+)
 
 
 def swing(x, u=None, dt=None):
@@ -142,6 +154,28 @@ LAWS = {
     ),
     "InertialErrorFixes": (InertialErrorFixes(1e-3, 10.0, 10.0), SINS_ERRORS, SINS, None),
     "InertialErrorFixes outliers": (InertialErrorFixes(1e-3, 10.0, 10.0, 0.15), SINS_ERRORS, SINS, None),
+    "StrapdownTransition": (StrapdownTransition(ORIGIN, **IMU_WALKS), STATES, INCREMENTS, 0.2),
+    "StrapdownTransition biases decay, dt a row": (
+        StrapdownTransition(ORIGIN, **IMU_WALKS, gyro_bias_time_s=50.0, accel_bias_time_s=20.0),
+        STATES,
+        INCREMENTS[0],
+        torch.tensor([[0.1], [0.0], [2.0], [0.5], [0.1]], dtype=DOUBLE),
+    ),
+    "NavigationFixes": (NavigationFixes(position_sd_m=2.0, heading_sd_rad=0.1), STATES, None, None),
+    "NavigationFixes all, with arms": (
+        NavigationFixes(
+            position_sd_m=2.0,
+            velocity_sd_m_s=0.1,
+            height_sd_m=1.0,
+            heading_sd_rad=0.1,
+            body_velocity_sd_m_s=0.2,
+            antenna_m=normal(3, seed=13),
+            axle_m=normal(3, seed=14),
+        ),
+        STATES,
+        INCREMENTS,
+        0.2,
+    ),
     "GPTransition identity": (learned(), NEAR, None, None),
     "GPTransition next state": (learned("next_state", noise="latent"), NEAR, None, 10.0),
     "GPTransition residual": (learned("residual", ClohessyWiltshire(1.1e-3, 1e-9)), NEAR, None, 10.0),
@@ -168,7 +202,7 @@ def test_every_law_is_registered():
     laws = {type(law).__name__ for law, *_ in LAWS.values()}
     shipped = {
         name
-        for module in (tf.laws, relative_motion, error_model, tf.gp)
+        for module in (tf.laws, relative_motion, error_model, navigation, tf.gp)
         for name, member in inspect.getmembers(module, inspect.isclass)
         if issubclass(member, nn.Module)
         and inspect.signature(member.forward).return_annotation in (tf.Gaussian, "Gaussian")
