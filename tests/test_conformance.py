@@ -318,6 +318,10 @@ PARTICLE = {
     "LLPF redrawn on resampling": lambda m: tf.LocallyLinearizedParticleFilter(m, 20, redraw="resample", split=0.0),
     "LLPF literal": lambda m: tf.LocallyLinearizedParticleFilter(m, 20, split=None, redraw="resample"),
     "LLPF never split": lambda m: tf.LocallyLinearizedParticleFilter(m, 20, split=1.0, resampler=resampling.systematic),
+    "RBPF first drawn": lambda m: tf.RaoBlackwellizedParticleFilter(m, 20, drawn=[0]),
+    "RBPF all but the first": lambda m: tf.RaoBlackwellizedParticleFilter(
+        m, 20, drawn=slice(1, None), rule=moments.cubature(), resampler=resampling.systematic
+    ),
     "ParticleFilter": lambda m: tf.ParticleFilter(m, 20, tf.proposals.Prior(), ess_below(0.5)),
 }
 
@@ -362,7 +366,10 @@ def test_gaussian_filters_with_controls_and_time_steps(name):
     check_filter(GAUSSIAN[name](SWINGING), ys, normal(6, 3, 2), dt.unsqueeze(-1) * torch.tensor([1.0, 0.5, 2.0]))
 
 
-@pytest.mark.parametrize("name", ["Bootstrap always", "Bootstrap moved", "UPF pooled", "UPF joint", "LLPF redrawn"])
+@pytest.mark.parametrize(
+    "name",
+    ["Bootstrap always", "Bootstrap moved", "UPF pooled", "UPF joint", "LLPF redrawn", "RBPF first drawn"],
+)
 def test_particle_filters_with_controls_and_time_steps(name):
     _, ys = MODELS["swinging"]
     dt = torch.tensor([0.1, 0.0, 0.2, 0.1, 0.3, 0.1], dtype=DOUBLE)

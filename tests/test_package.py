@@ -57,7 +57,7 @@ LAYERS = [
     ["moments", "resampling", "laws", "history", "kernels"],
     ["model", "gp", "recording"],
     ["proposals", "moves", "models"],
-    ["run"],
+    ["run", "rao_blackwell"],
     ["filters"],
     ["smoothing", "robust", "metrics"],
     ["learning", "report", "io", "testing"],

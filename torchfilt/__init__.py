@@ -1,6 +1,6 @@
 """Probabilistic filtering in PyTorch: one state-space model, any filter, gradients through everything."""
 
-from torchfilt import kernels, moments, moves, proposals, resampling, spaces
+from torchfilt import kernels, moments, moves, proposals, rao_blackwell, resampling, spaces
 from torchfilt.filters import (
     AuxiliaryParticleFilter,
     BootstrapFilter,
@@ -12,6 +12,7 @@ from torchfilt.filters import (
     KalmanFilter,
     LocallyLinearizedParticleFilter,
     ParticleFilter,
+    RaoBlackwellizedParticleFilter,
     RegularizedParticleFilter,
     UnscentedKalmanFilter,
     UnscentedParticleFilter,
@@ -56,6 +57,7 @@ __all__ = [
     "ParticleFilter",
     "Particles",
     "Product",
+    "RaoBlackwellizedParticleFilter",
     "RegularizedParticleFilter",
     "StateSpaceModel",
     "StepInfo",
@@ -73,6 +75,7 @@ __all__ = [
     "moments",
     "moves",
     "proposals",
+    "rao_blackwell",
     "resampling",
     "spaces",
     "testing",

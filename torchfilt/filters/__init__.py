@@ -14,6 +14,7 @@ from torchfilt.filters.particle_methods import (
     AuxiliaryParticleFilter,
     BootstrapFilter,
     LocallyLinearizedParticleFilter,
+    RaoBlackwellizedParticleFilter,
     RegularizedParticleFilter,
     UnscentedParticleFilter,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "KalmanFilter",
     "LocallyLinearizedParticleFilter",
     "ParticleFilter",
+    "RaoBlackwellizedParticleFilter",
     "RegularizedParticleFilter",
     "UnscentedKalmanFilter",
     "UnscentedParticleFilter",

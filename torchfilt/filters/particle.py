@@ -86,7 +86,8 @@ class ParticleFilter(Filter[Particles]):
             )
         self.particles, self.proposal, self.resampler, self.move = particles, proposal, resampler, move
         self.kernel, self.look_ahead, self.fast_normals = kernel, look_ahead, fast_normals
-        linear = model.is_linear() and isinstance(model.initial(), Gaussian)
+        own = getattr(proposal, "is_exact", None)
+        linear = own(model, size) if own else model.is_linear() and isinstance(model.initial(), Gaussian)
         # Where linearisation leaves nothing out, a bank of Gaussians is a proper importance sampler.
         self.evidence = "unbiased" if linear and proposal.evidence == "linearized" else proposal.evidence
         if kernel is not None:
@@ -257,7 +258,10 @@ def _mend(belief: Particles, proposed: Proposed, log_weights: Tensor) -> tuple[P
     factor = proposed.scale_tril
     if factor is not None:
         before = belief.scale_tril if belief.scale_tril is not None else torch.zeros_like(factor)
-        factor = _laid_out_as(factor, torch.where(bad.unsqueeze(-1), before, factor))
+        lost = bad.unsqueeze(-1)
+        if factor.shape[-3] == 1:  # all particles' own, which one that is sick says nothing about
+            lost = ~torch.isfinite(factor).all(-1, keepdim=True).all(-2, keepdim=True)
+        factor = _laid_out_as(factor, torch.where(lost, before, factor))
     after = Particles(x, kept, factor, proposed.space, (kept, weights))
     return after, log_likelihood, alive & torch.isfinite(x).all(-1).all(-1)
 

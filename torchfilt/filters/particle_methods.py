@@ -1,11 +1,14 @@
 """The particle methods of the literature: each is the one loop with its own parts."""
 
+from collections.abc import Sequence
+
 from torchfilt.filters.particle import ParticleFilter
 from torchfilt.kernels import Regularize
 from torchfilt.model import StateSpaceModel
-from torchfilt.moments import Rule, unscented
+from torchfilt.moments import Rule, taylor, unscented
 from torchfilt.moves import MetropolisHastings
 from torchfilt.proposals import Local, LookAhead, Prior, Redraw, Weights
+from torchfilt.rao_blackwell import RaoBlackwellized
 from torchfilt.resampling import Resampler, ess_below, systematic
 
 
@@ -96,3 +99,20 @@ def RegularizedParticleFilter(
     """
     kernel = Regularize() if kernel is None else kernel
     return ParticleFilter(model, particles, Prior(), resampler, kernel=kernel, fast_normals=fast_normals)
+
+
+def RaoBlackwellizedParticleFilter(
+    model: StateSpaceModel,
+    particles: int = 200,
+    *,
+    drawn: slice | Sequence[int],
+    rule: Rule | None = None,
+    resampler: Resampler | None = None,
+) -> ParticleFilter:
+    """Particles over the ``drawn`` error components, each with a Gaussian over the others.
+
+    Everything drawn, ``slice(None)``, is the bootstrap filter, nothing, ``()``, the Gaussian filter of ``rule``.
+
+    Source: Schon, Gustafsson, Nordlund, IEEE TSP 53 (2005).
+    """
+    return ParticleFilter(model, particles, RaoBlackwellized(drawn, rule or taylor()), resampler or ess_below(0.5))
