@@ -374,7 +374,7 @@ def test_second_order_against_newtons_law():
     assert math.log2(coarse[2] / middle[2]) > 3.5  # attitude: coning of fourth order
     # Longer groups of the same samples cost little; single samples, which show no coning, cost a lot.
     assert after(1, 10)[2] < 1e-8
-    assert after(1, 1)[2] > 100 * fine[2]
+    assert after(4, 1)[2] > 100 * middle[2]
 
 
 @pytest.mark.slow
@@ -473,7 +473,7 @@ def test_derivatives_and_one_graph():
         return end.quaternion, end.velocity, end.latitude, end.longitude, 1e-3 * end.height
 
     inputs[4] = (nav.height / 1e3).requires_grad_()
-    assert torch.autograd.gradcheck(step, inputs, check_forward_ad=True)
+    assert torch.autograd.gradcheck(step, inputs, check_forward_ad=True, fast_mode=True)
     samples = [normal(2, 3, 3, seed=k).requires_grad_() for k in (7, 8)]
     assert torch.autograd.gradcheck(compensate, samples, check_forward_ad=True)
     assert torch.autograd.gradcheck(lambda a, b: join(0.3 * a, b), samples, check_forward_ad=True)

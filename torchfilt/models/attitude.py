@@ -5,8 +5,6 @@ that the identity is a level vehicle with its nose to the north. RoMa does the m
 first one is made. Leading dims broadcast everywhere.
 """
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -116,25 +114,16 @@ def mean_rotation(v: Tensor) -> Tensor:
     Jacobian of the exponential: exp(v + d) = exp(mean_rotation(v) d) exp(v) to first order in d.
     """
     square = v.square().sum(-1)
-    small = square < 0.25
-    # Where the other branch is taken, its argument is a harmless one: derivatives of both are formed.
-    s = torch.where(small, square, 0)
+    small = square < 1e-5
+    # Where the series is taken, the argument of the other branch is a harmless one: derivatives of both are formed.
     angle2 = torch.where(small, 1, square)
     angle = angle2.sqrt()
-    # (1 - cos a) / a^2 and (a - sin a) / a^3; the series of the second is cut below 1e-15.
-    first = torch.where(small, _series(s, 2), 2 * (angle / 2).sin().square() / angle2)
-    second = torch.where(small, _series(s, 3), (angle - angle.sin()) / (angle2 * angle))
+    # (1 - cos a) / a^2 and (a - sin a) / a^3; what the series leave out is below 1e-15 beside the products they weigh.
+    first = torch.where(small, 1 / 2 - square / 24, 2 * (angle / 2).sin().square() / angle2)
+    second = torch.where(small, 1 / 6 - square / 120, (angle - angle.sin()) / (angle2 * angle))
     cross = skew(v)
     identity = torch.eye(3, dtype=v.dtype, device=v.device)
     return identity + first[..., None, None] * cross + second[..., None, None] * (cross @ cross)
-
-
-def _series(s: Tensor, start: int) -> Tensor:
-    """Sum of (-s)^k / (2 k + start)! for s up to 0.25."""
-    total = torch.zeros_like(s)
-    for k in range(5, -1, -1):
-        total = 1 / math.factorial(2 * k + start) - s * total
-    return total
 
 
 def ned_frd_to_enu_rfu(q: Tensor) -> Tensor:

@@ -158,7 +158,7 @@ class StrapdownTransition(nn.Module):
         """What is left of the six biases after a step, (6,) or (..., 6)."""
         if not any(self.bias_times_s):
             return x.new_ones(6)
-        step = dt if isinstance(dt, Tensor) and dt.dim() > 0 else x.new_tensor([dt])
+        step = (dt if dt.dim() > 0 else dt.reshape(1)) if isinstance(dt, Tensor) else x.new_tensor([dt])
         left = [torch.ones_like(step) if time is None else torch.exp(-step / time) for time in self.bias_times_s]
         return torch.cat([part.expand(*step.shape[:-1], 3) for part in left], -1)
 

@@ -224,7 +224,7 @@ def advance(
 
 def _advance(quaternion: Tensor, velocity: Tensor, mid: _Middle, dtheta: Tensor, dt: Tensor | float) -> Advance:
     turn = mid.rate * dt
-    end = velocity + mid.force - _cross(turn, mid.force) / 2 - mid.weight - _cross(mid.earth * dt + turn, mid.velocity)
+    end = velocity + _change(mid.force, mid.weight, mid.earth * dt, turn, mid.velocity)
     before, after = from_rotation_vector(torch.stack(torch.broadcast_tensors(-turn, dtheta), -2)).unbind(-2)
     q = multiply(multiply(before, quaternion), after)
     east, north, up = ((velocity + end) / 2).unbind(-1)
