@@ -6,7 +6,7 @@ Axes are ENU (navigation) and right-forward-up (body); an attitude is a quaterni
 
 from torchfilt.lazy import lazy_names
 
-_HOMES = dict.fromkeys(["earth", "error_model", "flight", "imu", "navigation", "strapdown"], "")
+_HOMES = dict.fromkeys(["alignment", "earth", "error_model", "flight", "imu", "navigation", "strapdown"], "")
 
 __all__ = sorted(_HOMES)
 
