@@ -50,7 +50,7 @@ def imports(tree, outside_functions=False):
 # From the bottom up. A file imports what lies below it, and within its own folder. What stands on one line stands side
 # by side and knows nothing of its neighbours.
 LAYERS = [
-    ["lazy", "linalg", "storage"],
+    ["lazy", "linalg", "quaternions", "storage"],
     ["spaces"],
     ["gaussian", "particles", "noise"],
     ["types"],

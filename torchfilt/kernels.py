@@ -94,10 +94,10 @@ class Regularize:
             noise: standard normals (*batch, n, k) with k of `normals`.
             chosen: (*batch), rows that were resampled; None for all.
         """
-        space, weights = cloud.space, cloud.weights
-        mean = space.mean(cloud.x, weights).unsqueeze(-2)
-        apart = space.local(mean, cloud.x)
-        whole = _factor(apart - weighted_sum(apart, weights).unsqueeze(-2), weights)
+        space, cloud = cloud.space, cloud.with_centre()
+        assert cloud.centre is not None
+        mean = cloud.centre.mean.unsqueeze(-2)
+        whole = _factor(cloud.centre.errors, cloud.weights)
         size = whole.shape[-1]
         h = self.bandwidth or optimal_bandwidth(size, resampled.x.shape[-2], self.shape, self.multimodal)
         step = h * (whole @ self._unit(noise, size).mT).mT

@@ -6,15 +6,25 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfilt.spaces import EUCLIDEAN, Space, steady_sum, weighted_sum
+from torchfilt.spaces import EUCLIDEAN, Space, centred, steady_sum, weighted_sum
+
+
+class Centre(NamedTuple):
+    """Mean (*batch, d) of the points x and their errors (*batch, n, e) from it, on a space, under these log-weights."""
+
+    x: Tensor
+    log_weights: Tensor
+    space: Space
+    mean: Tensor
+    errors: Tensor
 
 
 class Particles(NamedTuple):
     """Particles x (*batch, n, d) with normalised log-weights (*batch, n).
 
     scale_tril (*batch, n, e, e), or (*batch, 1, e, e) when all particles share it, makes each particle a Gaussian;
-    None means points. ``held`` keeps (log_weights, weights) where the weights were already made; it counts only for the
-    very log_weights it names, so replacing these is safe.
+    None means points. ``held`` keeps (log_weights, weights) where the weights were already made, ``centre`` the mean;
+    they count only for the very tensors they name, so replacing these is safe.
     """
 
     x: Tensor
@@ -22,6 +32,7 @@ class Particles(NamedTuple):
     scale_tril: Tensor | None = None
     space: Space = EUCLIDEAN
     held: tuple[Tensor, Tensor] | None = None
+    centre: Centre | None = None
 
     @property
     def weights(self) -> Tensor:
@@ -33,7 +44,8 @@ class Particles(NamedTuple):
     @property
     def mean(self) -> Tensor:
         """Intrinsic weighted mean (*batch, d)."""
-        return self.space.mean(self.x, self.weights)
+        known = self._known()
+        return known.mean if known is not None else self.space.mean(self.x, self.weights)
 
     @property
     def covariance(self) -> Tensor:
@@ -47,12 +59,29 @@ class Particles(NamedTuple):
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Mean (*batch, d) and covariance (*batch, e, e) of the mixture."""
-        weights = self.weights
-        mean = self.space.mean(self.x, weights)
-        covariance = second_moment(self.space.local(mean.unsqueeze(-2), self.x), weights)
+        known, weights = self._known(), self.weights
+        mean, errors = known[-2:] if known is not None else centred(self.space, self.x, weights)
+        covariance = second_moment(errors, weights)
         if self.scale_tril is not None:
             covariance = covariance + self._local_covariance(weights)
         return mean, covariance
+
+    def with_centre(self) -> "Particles":
+        """The same particles, which know their mean and errors: for who needs them more than once.
+
+        Found component by component in memory, whatever the order of x, by which sums round.
+        """
+        if self._known() is not None:
+            return self
+        by_component = self.x.movedim(-1, 0).contiguous().movedim(0, -1)
+        mean, errors = centred(self.space, by_component, self.weights)
+        return self._replace(centre=Centre(self.x, self.log_weights, self.space, mean, errors))
+
+    def _known(self) -> Centre | None:
+        """What is kept of the mean, if it belongs to these very particles."""
+        known = self.centre
+        same = known is not None and known.x is self.x and known.log_weights is self.log_weights
+        return known if same and known is not None and known.space is self.space else None
 
     def _local_covariance(self, weights: Tensor) -> Tensor:
         assert self.scale_tril is not None

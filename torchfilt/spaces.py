@@ -5,14 +5,15 @@ A space turns a tangent vector (the error, e numbers) into a point (d numbers) a
 (sampling, densities, innovations, means, covariances) follows from the two.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from torchfilt.linalg import is_differentiated
+from torchfilt.quaternions import conjugate, exponential, logarithm, product, quaternion, stack, vector
 
 
 @runtime_checkable
@@ -68,6 +69,17 @@ def steady_sum(values: Tensor, dim: int) -> Tensor:
 def weighted_sum(values: Tensor, weights: Tensor) -> Tensor:
     """Sum over n of weights (..., n) times values (..., n, d): the same bits for any thread count."""
     return steady_sum(values * weights.unsqueeze(-1), -2)
+
+
+def centred(space: Space, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Intrinsic mean (..., d) of points (..., n, d) and their errors from it (..., n, e), ``local(mean, points)``.
+
+    A curved space has the errors at hand when it has found the mean.
+    """
+    if isinstance(space, Angle | UnitQuaternion | Product):
+        return space.centred(points, weights)
+    mean = space.mean(points, weights)
+    return mean, space.local(mean.unsqueeze(-2), points)
 
 
 @dataclass(frozen=True)
@@ -140,6 +152,10 @@ class Angle:
         Where the circular average vanishes (opposite angles of equal weight) the iteration starts from the angle of the
         heaviest weight, the first among equals: a stationary point, though not the only one.
         """
+        return self.centred(points, weights)[0]
+
+    def centred(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """The `mean`, and what each point (..., n, d) is off it."""
         sine, cosine = weighted_sum(points.sin(), weights), weighted_sum(points.cos(), weights)
         vanishes = torch.hypot(sine, cosine) < _vanishing(weights).unsqueeze(-1)
         # The limit of the iteration does not depend on where it starts, and `atan2` has no derivative at zero.
@@ -149,13 +165,6 @@ class Angle:
     def observed(self, y: Tensor) -> Tensor:
         """Each angle on its own."""
         return ~torch.isnan(y)
-
-
-def _roma() -> ModuleType:
-    """RoMa, loaded with the first rotation: it brings the compiler of torch, a second of loading."""
-    import roma
-
-    return roma
 
 
 @dataclass(frozen=True)
@@ -184,23 +193,18 @@ class UnitQuaternion:
 
     def retract(self, x: Tensor, v: Tensor) -> Tensor:
         """Rotation x turned by the rotation vector v; the norm is restored."""
-        roma = _roma()
-        x, step = torch.broadcast_tensors(x, roma.rotvec_to_unitquat(v))
-        turned = roma.quat_product(x, step) if self.side == "right" else roma.quat_product(step, x)
-        return self.project(turned)
+        start, step = quaternion(x), exponential(vector(v.unbind(-1)))
+        turned = product(start, step) if self.side == "right" else product(step, start)
+        return self.project(stack(turned.parts()))
 
     def local(self, x: Tensor, y: Tensor) -> Tensor:
         """Rotation vector (at most pi long) that turns x into y; a norm that is not one does not count."""
-        roma = _roma()
-        x, y = torch.broadcast_tensors(x, y)
-        inverse = roma.quat_conjugation(x)
-        turn = roma.quat_product(inverse, y) if self.side == "right" else roma.quat_product(y, inverse)
-        rotation: Tensor = roma.unitquat_to_rotvec(self.project(turn))
-        return rotation
+        back, end = conjugate(quaternion(x)), quaternion(y)
+        return stack(logarithm(product(back, end) if self.side == "right" else product(end, back)))
 
     def project(self, x: Tensor) -> Tensor:
         """Normalised quaternion."""
-        return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True)
+        return x * x.square().sum(-1, keepdim=True).rsqrt()
 
     def mean(self, points: Tensor, weights: Tensor) -> Tensor:
         """Sign-aligned normalised average, then the intrinsic iteration.
@@ -211,9 +215,13 @@ class UnitQuaternion:
 
         Source: Pennec, Computing the mean of geometric features, INRIA report 3371 (1998).
         """
+        return self.centred(points, weights)[0]
+
+    def centred(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """The `mean`, and the errors (..., n, 3) of all points from it."""
         heaviest = _heaviest(points, weights)
-        opposite = (points * heaviest.unsqueeze(-2)).sum(-1, keepdim=True) < 0
-        average = weighted_sum(torch.where(opposite, -points, points), weights)
+        side = torch.copysign(weights.new_ones(()), (points * heaviest.unsqueeze(-2)).sum(-1).detach())
+        average = weighted_sum(points, weights * side)
         vanishes = torch.linalg.vector_norm(average, dim=-1, keepdim=True) < _vanishing(weights).unsqueeze(-1)
         # The limit of the iteration does not depend on where it starts.
         start = self.project(torch.where(vanishes, heaviest, average).detach())
@@ -259,27 +267,38 @@ class Product:
     def retract(self, x: Tensor, v: Tensor) -> Tensor:
         """Each part along its own tangent."""
         parts = zip(self.spaces, x.split(self._sizes, -1), v.split(self._tangent_sizes, -1), strict=True)
-        return torch.cat([space.retract(a, b) for space, a, b in parts], -1)
+        return _side_by_side([space.retract(a, b) for space, a, b in parts])
 
     def local(self, x: Tensor, y: Tensor) -> Tensor:
         """Each part's own tangent vector."""
         parts = zip(self.spaces, x.split(self._sizes, -1), y.split(self._sizes, -1), strict=True)
-        return torch.cat([space.local(a, b) for space, a, b in parts], -1)
+        return _side_by_side([space.local(a, b) for space, a, b in parts])
 
     def project(self, x: Tensor) -> Tensor:
         """Each part by its own rule."""
         parts = zip(self.spaces, x.split(self._sizes, -1), strict=True)
-        return torch.cat([space.project(a) for space, a in parts], -1)
+        return _side_by_side([space.project(a) for space, a in parts])
 
     def mean(self, points: Tensor, weights: Tensor) -> Tensor:
         """Each part's own mean."""
         parts = zip(self.spaces, points.split(self._sizes, -1), strict=True)
-        return torch.cat([space.mean(a, weights) for space, a in parts], -1)
+        return _side_by_side([space.mean(a, weights) for space, a in parts])
+
+    def centred(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Each part's own mean and errors."""
+        parts = zip(self.spaces, points.split(self._sizes, -1), strict=True)
+        means, errors = zip(*(centred(space, a, weights) for space, a in parts), strict=True)
+        return _side_by_side(means), _side_by_side(errors)
 
     def observed(self, y: Tensor) -> Tensor:
         """Each part by its own rule."""
         parts = zip(self.spaces, y.split(self._sizes, -1), strict=True)
         return torch.cat([space.observed(a) for space, a in parts], -1)
+
+
+def _side_by_side(parts: Sequence[Tensor]) -> Tensor:
+    """Parts (..., k_i) as one (..., k), component by component in memory: what follows works on components."""
+    return torch.cat([part.movedim(-1, 0) for part in parts]).movedim(0, -1)
 
 
 def _heaviest(points: Tensor, weights: Tensor) -> Tensor:
@@ -297,31 +316,36 @@ def _vanishing(weights: Tensor) -> Tensor:
 
 def _intrinsic_mean(
     space: Space, points: Tensor, weights: Tensor, start: Tensor, *, curved: bool = False, iterations: int = 20
-) -> Tensor:
-    """Fixed-point iteration ``m <- retract(m, sum of w local(m, x))``; rows stop one by one, never because of others.
+) -> tuple[Tensor, Tensor]:
+    """Mean and errors from it by the fixed-point iteration ``m <- retract(m, sum of w local(m, x))``.
 
-    In a curved space a round multiplies the error by a factor, at most the mean of ``|w| angle^2 / 8`` (for angles
-    below 2.7 rad). The derivative gains the same factor a round and starts from nothing, so its rounds are counted too.
+    Rows stop one by one, never because of others. In a curved space a round multiplies the error by a factor, at most
+    the mean of ``|w| angle^2 / 8`` (for angles below 2.7 rad). The derivative gains the same factor a round and starts
+    from nothing, so its rounds are counted too.
     """
-    mean = start
+    mean, errors = start, space.local(start.unsqueeze(-2), points)
     scale = weights.abs()
     tolerance = 8 * torch.finfo(points.dtype).eps * scale.sum(-1, keepdim=True)
     differentiated = is_differentiated(points, weights)
     active = torch.ones(mean.shape[:-1], dtype=torch.bool, device=mean.device).unsqueeze(-1)
     for rounds in range(1, iterations + 1):
-        vectors = space.local(mean.unsqueeze(-2), points)
-        step = weighted_sum(vectors, weights)
+        step = weighted_sum(errors, weights)
+        active = active & (step.abs().amax(-1, keepdim=True) > tolerance)
+        if not differentiated and _all_false(active):
+            break
         new = space.retract(mean, step)
         # A row that has stopped keeps its value, to the bit, and goes on with its derivative.
-        mean = new + (torch.where(active, new, mean) - new).detach()
-        active = active & (step.abs().amax(-1, keepdim=True) > tolerance)
+        mean = (
+            new + (torch.where(active, new, mean) - new).detach() if differentiated else torch.where(active, new, mean)
+        )
         unfinished = active
         if curved and differentiated:
-            factor = (vectors.detach().square().sum(-1) * scale).sum(-1, keepdim=True) / 8
+            factor = (errors.detach().square().sum(-1) * scale).sum(-1, keepdim=True) / 8
             unfinished = active | (factor**rounds > tolerance)
+        errors = space.local(mean.unsqueeze(-2), points)
         if _all_false(unfinished):
             break
-    return mean
+    return mean, errors
 
 
 def _all_false(flags: Tensor) -> bool:

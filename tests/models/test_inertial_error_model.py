@@ -13,7 +13,7 @@ from torch.distributions import Categorical, Independent, MixtureSameFamily, Nor
 from torchfilt.gaussian import Gaussian
 from torchfilt.model import as_gaussian, log_prob
 from torchfilt.models import attitude
-from torchfilt.models.inertial import components, error_model
+from torchfilt.models.inertial import error_model
 from torchfilt.models.inertial.earth import LocalMetres
 from torchfilt.models.inertial.error_model import (
     ERROR_SPACE,
@@ -532,36 +532,6 @@ def test_draws_of_outliers():
     # Outliers spoil a whole fix: large components come together.
     together = (square[..., 0] * square[..., 1]).mean() - expected**2
     assert together > 0.5 * (0.8 + 0.2 * 81 - expected**2)
-
-
-# Components -----------------------------------------------------------------------------------------------------------
-
-
-def test_components_rotate_as_scipy_does():
-    a, b, v = (normal(50, n, seed=n) for n in (4, 5, 3))
-    a, b = (q / q.norm(dim=-1, keepdim=True) for q in (a, b[:, :4]))
-    one, two = (Rotation.from_quat(q.numpy()) for q in (a, b))
-    p, q, w = components.quaternion(a), components.quaternion(b), components.vector(v.unbind(-1))
-    limit = {"rtol": 0, "atol": 16 * EPS}
-    np.testing.assert_allclose(components.stack(components.rotate(p, w)), one.apply(v), **limit)
-    np.testing.assert_allclose(components.stack(components.rotate_back(p, w)), one.inv().apply(v), **limit)
-    product = Rotation.from_quat(components.stack(components.product(p, q).parts()).numpy())
-    assert (product * (one * two).inv()).magnitude().max() < 16 * EPS
-    np.testing.assert_allclose(components.stack(components.cross(w, w[::-1])), np.cross(v, v.flip(-1)), **limit)
-    matrix = normal(50, 9, seed=9)
-    found = components.stack(components.apply(matrix.unbind(-1), w))
-    np.testing.assert_allclose(found, (matrix.unflatten(-1, (3, 3)) @ v.unsqueeze(-1)).squeeze(-1), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(components.stack(components.minus(w, w[::-1])), v - v.flip(-1), rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(("size", "allowed"), [(0.0, 1.0), (1e-6, 4.0), (0.5, 8.0), (1.0, 1300.0)])
-def test_half_rotation(size, allowed):
-    v = normal(20, 3)
-    v = v / v.norm(dim=-1, keepdim=True) * size
-    found = components.stack(components.half_rotation(components.vector(v.unbind(-1))).parts())
-    assert (found.norm(dim=-1) - 1).abs().max() < allowed * EPS
-    away = Rotation.from_quat(found.numpy()) * Rotation.from_rotvec(v.numpy() / 2).inv()
-    assert away.magnitude().max() < allowed * EPS
 
 
 def test_layout_of_the_control():

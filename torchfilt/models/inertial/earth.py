@@ -62,7 +62,12 @@ _SOMIGLIANA = (1 - WGS84.flattening) * WGS84.gravity_pole_m_s2 / WGS84.gravity_e
 
 def radii(latitude_rad: Tensor) -> tuple[Tensor, Tensor]:
     """Radii of curvature of the meridian and of the prime vertical (across it), each (...), m."""
-    w2 = 1 - WGS84.eccentricity2 * latitude_rad.sin().square()
+    return radii_at(latitude_rad.sin().square())
+
+
+def radii_at(sine2: Tensor) -> tuple[Tensor, Tensor]:
+    """`radii` where the square of the latitude's sine is known, (...)."""
+    w2 = 1 - WGS84.eccentricity2 * sine2
     transverse = WGS84.semi_major_m / w2.sqrt()
     return transverse * (1 - WGS84.eccentricity2) / w2, transverse
 
@@ -76,11 +81,16 @@ def gravity(latitude_rad: Tensor, height_m: Tensor) -> Tensor:
 
     Source: NGA.STND.0036 (2014), equations 4-1 and 4-3.
     """
-    sin2 = latitude_rad.sin().square()
-    a, f = WGS84.semi_major_m, WGS84.flattening
-    surface = WGS84.gravity_equator_m_s2 * (1 + _SOMIGLIANA * sin2) / (1 - WGS84.eccentricity2 * sin2).sqrt()
-    ratio = height_m / a
-    return surface * (1 - 2 * (1 + f + WGS84.centrifugal_ratio - 2 * f * sin2) * ratio + 3 * ratio.square())
+    return gravity_at(latitude_rad.sin().square(), height_m)
+
+
+def gravity_at(sine2: Tensor, height_m: Tensor) -> Tensor:
+    """`gravity` where the square of the latitude's sine is known, (...)."""
+    equator, f = WGS84.gravity_equator_m_s2, WGS84.flattening
+    surface = (equator + equator * _SOMIGLIANA * sine2) / (1 - WGS84.eccentricity2 * sine2).sqrt()
+    ratio = height_m / WGS84.semi_major_m
+    falls = 2 * (1 + f + WGS84.centrifugal_ratio) - 4 * f * sine2
+    return surface * (1 + ratio * (3 * ratio - falls))
 
 
 def radii_slopes(latitude_rad: Tensor) -> tuple[Tensor, Tensor]:

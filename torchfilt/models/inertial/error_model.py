@@ -18,12 +18,25 @@ from torch.distributions import Distribution
 from torchfilt.gaussian import LOG_2PI, Gaussian
 from torchfilt.laws import hold
 from torchfilt.models import attitude
-from torchfilt.models.inertial.components import (
+from torchfilt.models.inertial.earth import (
+    WGS84,
+    LocalMetres,
+    earth_rate_enu,
+    gravity,
+    gravity_at,
+    radii,
+    radii_at,
+    slopes,
+    transport_rate_enu,
+)
+from torchfilt.models.inertial.imu import ImuGrade, StartErrors
+from torchfilt.models.inertial.strapdown import Navigation, increments, navigate
+from torchfilt.quaternions import (
     Quaternion,
     Vector,
     apply,
     cross,
-    half_rotation,
+    exponential,
     minus,
     product,
     quaternion,
@@ -32,17 +45,6 @@ from torchfilt.models.inertial.components import (
     stack,
     vector,
 )
-from torchfilt.models.inertial.earth import (
-    WGS84,
-    LocalMetres,
-    earth_rate_enu,
-    gravity,
-    radii,
-    slopes,
-    transport_rate_enu,
-)
-from torchfilt.models.inertial.imu import ImuGrade, StartErrors
-from torchfilt.models.inertial.strapdown import Navigation, increments, navigate
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion, wrap_angle
 
 ERROR_SPACE = Product(UnitQuaternion("left"), Euclidean(12))
@@ -310,7 +312,7 @@ def _propagate(x: Tensor, u: SinsStep, dt: Tensor | float, origin: LocalMetres) 
     gained = minus(force, rotate_back(error, felt))
     # Half-way, the Earth's terms left out: there they would change nothing that counts.
     half_velocity = vector([torch.add(v, g, alpha=0.5) for v, g in zip(velocity, gained, strict=True)])
-    north, up = position[1] + velocity[1] * (0.5 * dt), position[2] + velocity[2] * (0.5 * dt)
+    north, up = _after(position[1], velocity[1], 0.5 * dt), _after(position[2], velocity[2], 0.5 * dt)
     true_velocity = minus(computed, half_velocity)
     true_latitude, true_height = latitude - north / origin.north_m, height - up
     seen = _earth_terms(computed, latitude, height, origin)
@@ -319,21 +321,26 @@ def _propagate(x: Tensor, u: SinsStep, dt: Tensor | float, origin: LocalMetres) 
     # d/dt C(dq) = [(C_computed drift - w_computed + C(dq) w_true) x] C(dq), w the rate of the ENU axes.
     turned_rate = rotate(error, real.rate)
     turning = zip(apply(attitude_s, drift), seen.rate, turned_rate, strict=True)
-    turn = vector([d - (s - r) * dt for d, s, r in turning])
-    half_turn = half_rotation(turn)
+    turn = vector([_after(d, r - s, dt) for d, s, r in turning])
+    half_turn = exponential(turn, 0.5)
     middle = product(half_turn, error)
 
     pushed = minus(force, rotate_back(middle, felt))
     pushing = zip(velocity, pushed, seen.acceleration, real.acceleration, strict=True)
-    after = vector([v + p + (s - r) * dt for v, p, s, r in pushing])
-    mean_velocity = vector([0.5 * (v + a) for v, a in zip(velocity, after, strict=True)])
+    after = vector([_after(v + p, s - r, dt) for v, p, s, r in pushing])
+    mean_velocity = vector([torch.lerp(v, a, 0.5) for v, a in zip(velocity, after, strict=True)])
     # The computed position moves by seen.scale * computed, the true one by real.scale * (computed - mean_velocity).
     ground = zip(position[:2], seen.scale, real.scale, computed[:2], mean_velocity[:2], strict=True)
-    moved = [p + ((s - r) * c + r * m) * dt for p, s, r, c, m in ground]
+    moved = [_after(p, torch.addcmul((s - r) * c, r, m), dt) for p, s, r, c, m in ground]
     return _Motion(
-        product(half_turn, middle), after, vector([*moved, position[2] + mean_velocity[2] * dt]), turn, middle, felt,
-        true_velocity, true_latitude, true_height, turned_rate, mean_velocity, real.scale,
+        product(half_turn, middle), after, vector([*moved, _after(position[2], mean_velocity[2], dt)]), turn, middle,
+        felt, true_velocity, true_latitude, true_height, turned_rate, mean_velocity, real.scale,
     )  # fmt: skip
+
+
+def _after(start: Tensor, rate: Tensor, dt: Tensor | float) -> Tensor:
+    """Where a constant rate leads to."""
+    return torch.addcmul(start, rate, dt) if isinstance(dt, Tensor) else torch.add(start, rate, alpha=dt)
 
 
 class _EarthTerms(NamedTuple):
@@ -349,14 +356,15 @@ class _EarthTerms(NamedTuple):
 def _earth_terms(velocity: Vector, latitude: Tensor, height: Tensor, origin: LocalMetres) -> _EarthTerms:
     """As `earth.earth_rate_enu` and `earth.transport_rate_enu`, by components."""
     east, north, _ = velocity
-    meridian, transverse = radii(latitude)
     sine, cosine = latitude.sin(), latitude.cos()
+    sine2 = sine.square()
+    meridian, transverse = radii_at(sine2)
     per_north, per_east = (meridian + height).reciprocal(), (transverse + height).reciprocal()
     turn = east * per_east
     spin_north, spin_up = WGS84.rate_rad_s * cosine, WGS84.rate_rad_s * sine
-    rate = (-north * per_north, spin_north + turn, spin_up + turn * (sine / cosine))
+    rate = (-north * per_north, spin_north + turn, torch.addcmul(spin_up, turn, sine / cosine))
     coriolis = cross(velocity, (rate[0], rate[1] + spin_north, rate[2] + spin_up))
-    acceleration = (coriolis[0], coriolis[1], coriolis[2] - gravity(latitude, height))
+    acceleration = (coriolis[0], coriolis[1], coriolis[2] - gravity_at(sine2, height))
     return _EarthTerms(rate, acceleration, (origin.east_m * per_east / cosine, origin.north_m * per_north))
 
 

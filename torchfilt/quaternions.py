@@ -1,0 +1,122 @@
+"""Vectors and unit quaternions by components, for what runs once for every particle.
+
+A component of all particles lies flat in memory: an operation on it costs what memory costs, where a row of four
+numbers a particle, as RoMa has it, costs several times as much. Order x y z w, Hamilton product, as in RoMa, which is
+what the formulas are tested against. All functions broadcast over the shape of the components.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+Vector = tuple[Tensor, Tensor, Tensor]
+
+
+class Quaternion(NamedTuple):
+    """Vector part and scalar part."""
+
+    axis: Vector
+    scalar: Tensor
+
+    def parts(self) -> list[Tensor]:
+        """The four components."""
+        return [*self.axis, self.scalar]
+
+
+def vector(parts: Sequence[Tensor]) -> Vector:
+    """Three components."""
+    x, y, z = parts
+    return x, y, z
+
+
+def quaternion(q: Tensor) -> Quaternion:
+    """Components of quaternions (..., 4)."""
+    x, y, z, w = q.unbind(-1)
+    return Quaternion((x, y, z), w)
+
+
+def stack(parts: Sequence[Tensor]) -> Tensor:
+    """Components (...) as a vector (..., d), component by component in memory."""
+    if any(part.shape != parts[0].shape for part in parts):
+        parts = torch.broadcast_tensors(*parts)
+    return torch.stack(list(parts)).movedim(0, -1)
+
+
+def minus(a: Vector, b: Vector) -> Vector:
+    """Difference a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def apply(matrix: Sequence[Tensor], v: Sequence[Tensor]) -> Vector:
+    """Matrix, nine entries row by row, times v."""
+    rows = (matrix[0:3], matrix[3:6], matrix[6:9])
+    return vector([torch.addcmul(torch.addcmul(r[0] * v[0], r[1], v[1]), r[2], v[2]) for r in rows])
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Cross product."""
+    return (
+        torch.addcmul(a[1] * b[2], a[2], b[1], value=-1),
+        torch.addcmul(a[2] * b[0], a[0], b[2], value=-1),
+        torch.addcmul(a[0] * b[1], a[1], b[0], value=-1),
+    )
+
+
+def rotate(q: Quaternion, v: Vector) -> Vector:
+    """Vector v turned by unit quaternions: with t = 2 axis x v the result is v + scalar t + axis x t."""
+    once = cross(q.axis, v)
+    twice = cross(q.axis, once)
+    parts = zip(v, once, twice, strict=True)
+    return vector([torch.add(x, torch.addcmul(t, q.scalar, o), alpha=2) for x, o, t in parts])
+
+
+def rotate_back(q: Quaternion, v: Vector) -> Vector:
+    """Vector v turned by the inverse of q, which is q with the other sign of the scalar."""
+    return rotate(Quaternion(q.axis, -q.scalar), v)
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """The inverse of unit quaternions."""
+    return Quaternion((-q.axis[0], -q.axis[1], -q.axis[2]), q.scalar)
+
+
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Hamilton product: turn by b first, then by a."""
+    parts = zip(cross(a.axis, b.axis), a.axis, b.axis, strict=True)
+    axis = [torch.addcmul(torch.addcmul(c, a.scalar, y), x, b.scalar) for c, x, y in parts]
+    scalar = a.scalar * b.scalar
+    for x, y in zip(a.axis, b.axis, strict=True):
+        scalar = torch.addcmul(scalar, x, y, value=-1)
+    return Quaternion(vector(axis), scalar)
+
+
+def exponential(v: Vector, share: float = 1.0) -> Quaternion:
+    """Unit quaternion of ``share`` of the rotation vector v in rad.
+
+    The length is kept off zero by less than rounding notices, so that no vector is a special case and derivatives stay.
+    """
+    length = (_square(v) + _tiny(v[0].dtype)).sqrt()
+    half = length * (0.5 * share)
+    scale = half.sin() / length
+    return Quaternion((v[0] * scale, v[1] * scale, v[2] * scale), half.cos())
+
+
+def logarithm(q: Quaternion) -> Vector:
+    """Rotation vector, at most pi long, of quaternions of any norm but zero; q and -q have the same."""
+    length = torch.addcmul(_square(q.axis), q.scalar, q.scalar, value=_tiny(q.scalar.dtype)).sqrt()
+    sign = torch.copysign(q.scalar.new_ones(()), q.scalar.detach())
+    twice = torch.atan2(length, q.scalar * sign) * 2
+    scale = twice / (length * sign)
+    return q.axis[0] * scale, q.axis[1] * scale, q.axis[2] * scale
+
+
+def _square(v: Vector) -> Tensor:
+    """Square of the length."""
+    return torch.addcmul(torch.addcmul(v[0] * v[0], v[1], v[1]), v[2], v[2])
+
+
+def _tiny(dtype: torch.dtype) -> float:
+    """What may be added to the square of a small angle: sin(a) / a and atan(a) / a change by less than rounding."""
+    return torch.finfo(dtype).eps / 4
