@@ -36,7 +36,7 @@ from torchfilt.models.relative_motion import (
     simulate_formation,
 )
 from torchfilt.moves import MetropolisHastings
-from torchfilt.resampling import Resampler, ess_below
+from torchfilt.resampling import Resampler, ess_below, kld_adaptive
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
 from torchfilt.testing import check_filter, check_law, check_resampler, check_rule, check_space
 
@@ -298,6 +298,10 @@ PARTICLE = {
     "Bootstrap adaptive stratified": lambda m: tf.BootstrapFilter(m, 40, ess_below(0.5, resampling.stratified)),
     "Bootstrap multinomial": lambda m: tf.BootstrapFilter(m, 40, resampling.multinomial),
     "Bootstrap residual": lambda m: tf.BootstrapFilter(m, 40, ess_below(0.8, resampling.residual)),
+    "Bootstrap adaptive number": lambda m: tf.BootstrapFilter(m, 40, kld_adaptive(0.6, 0.3, 0.1, 10)),
+    "UPF adaptive number": lambda m: tf.UnscentedParticleFilter(
+        m, 40, resampler=ess_below(0.7, kld_adaptive(0.3, 0.5, minimum=10))
+    ),
     "Bootstrap fast normals": lambda m: tf.BootstrapFilter(m, 40, fast_normals=True),
     "Bootstrap moved": lambda m: tf.BootstrapFilter(m, 40, move=MetropolisHastings(2)),
     "Bootstrap moved, predictive": lambda m: tf.BootstrapFilter(
@@ -395,7 +399,9 @@ RESAMPLERS = [resampling.systematic, resampling.stratified, resampling.residual,
 
 
 @pytest.mark.parametrize("n", [7, 50])
-@pytest.mark.parametrize("resampler", [*RESAMPLERS, ess_below(0.5)], ids=lambda r: f"{r.name}-{r.threshold}")
+@pytest.mark.parametrize(
+    "resampler", [*RESAMPLERS, ess_below(0.5), kld_adaptive(1.0)], ids=lambda r: f"{r.name}-{r.threshold}"
+)
 def test_resamplers(resampler, n):
     check_resampler(resampler, n, keeps_equal_weights=resampler.name != "multinomial")
 

@@ -11,16 +11,21 @@ from oracles import resampling_oracle as oracle
 from scipy import stats
 
 from torchfilt import resampling
+from torchfilt.particles import Particles
 from torchfilt.resampling import (
+    KldSize,
     Resampler,
     ess_below,
     gather_particles,
+    kld_adaptive,
+    kld_bound,
     multinomial,
     never,
     residual,
     stratified,
     systematic,
 )
+from torchfilt.spaces import UnitQuaternion
 
 SCHEMES = [systematic, stratified, multinomial, residual]
 schemes = pytest.mark.parametrize("scheme", SCHEMES, ids=lambda s: s.name)
@@ -75,6 +80,51 @@ def test_ancestors_of_any_weights(scheme, dtype, seed, n, spread):
     assert ours.min() >= 0 and ours.max() < n
     if scheme is not residual:  # its rounding is let off on purpose, see below
         assert ours.tolist() == getattr(oracle, scheme.name)(weights.tolist(), u.tolist())
+
+
+@schemes
+@given(data=st.data())
+def test_any_number_of_positions_is_that_of_the_definition(scheme, data):
+    """More and fewer than there are particles, another number in each row; counts and shares without rounding."""
+    n = 2 ** data.draw(st.integers(0, 4))
+    counts = [2 ** data.draw(st.integers(0, 6)) for _ in range(2)]
+    width = max(counts) + data.draw(st.integers(0, 2))
+    rows = []
+    for _ in counts:
+        cuts = sorted(data.draw(st.lists(st.integers(0, 64 * n), min_size=n - 1, max_size=n - 1)))
+        rows.append([b - a for a, b in zip([0, *cuts], [*cuts, 64 * n], strict=True)])
+    size = scheme.uniforms(width)
+    u = [[k / 64 for k in data.draw(st.lists(st.integers(0, 63), min_size=size, max_size=size))] for _ in counts]
+    weights, uniforms = torch.tensor(rows, dtype=torch.float64) / (64 * n), torch.tensor(u, dtype=torch.float64)
+    ours = scheme(weights, uniforms, torch.tensor(counts), width)
+    assert ours.shape == (2, width) and (ours.diff() >= 0).all() and ours.min() >= 0 and ours.max() < n
+    for k, m in enumerate(counts):
+        assert ours[k, :m].tolist() == getattr(oracle, scheme.name)(rows[k], u[k], m)
+        alone = scheme(weights[k], uniforms[k], torch.tensor(m), width)
+        assert torch.equal(alone, ours[k])
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+@schemes
+@given(seed=seeds, n=st.integers(1, 60))
+def test_as_many_positions_as_particles_change_no_bit(scheme, batch, seed, n):
+    weights, u = weights_of(*batch, n, seed=seed), uniforms(scheme, *batch, n=n, seed=seed)
+    assert torch.equal(scheme(weights, u, torch.full(batch, n), n), scheme(weights, u))
+
+
+@schemes
+@pytest.mark.parametrize("m", [7, 90])
+def test_copies_of_another_number_are_unbiased(scheme, m):
+    """20,000 draws of m positions from 30 weights: each mean count is m w within 5.5 standard errors."""
+    n, repeats = 30, 20_000
+    weights = weights_of(n, seed=3, spread=1.0)
+    counts = torch.full((repeats,), m)
+    ancestors = scheme(weights.expand(repeats, n), uniforms(scheme, repeats, n=m, seed=1), counts, m)
+    found = torch.zeros(repeats, n).scatter_add(-1, ancestors, torch.ones(repeats, m)).double()
+    fraction = (m * weights).frac()
+    # A copy that no draw happened to make has a deviation all the same.
+    standard = torch.maximum(found.std(0), (fraction * (1 - fraction)).sqrt()) / repeats**0.5
+    assert ((found.mean(0) - m * weights).abs() < 5.5 * standard + 10 / repeats).all()
 
 
 # Copies ---------------------------------------------------------------------------------------------------------------
@@ -244,6 +294,15 @@ def test_one_graph_gives_the_same_ancestors(scheme, shape):
         assert torch.equal(ours, eager)
 
 
+@schemes
+def test_one_graph_gives_any_number_of_ancestors(scheme):
+    weights, u = weights_of(3, 25, seed=0), uniforms(scheme, 3, n=40, seed=1)
+    counts = torch.tensor([40, 7, 25])
+    torch.compiler.reset()
+    compiled = torch.compile(lambda *parts: scheme(*parts, 40), fullgraph=True, backend="aot_eager")
+    assert torch.equal(compiled(weights, u, counts), scheme(weights, u, counts, 40))
+
+
 @pytest.mark.slow
 @schemes
 def test_generated_code_gives_the_same_ancestors(scheme):
@@ -277,17 +336,157 @@ def test_a_fraction_is_a_fraction(fraction):
         ess_below(fraction)
 
 
+# How many particles ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("delta", [0.2, 0.05, 0.01, 0.001])
+@pytest.mark.parametrize("epsilon", [0.02, 0.5])
+def test_the_bound_is_a_quantile_of_chi_square(epsilon, delta):
+    """Wilson and Hilferty's cube is 3 % off with one degree of freedom, 0.7 % with nine, 0.04 % with 99 at most."""
+    bins = torch.tensor([2, 3, 4, 5, 10, 100, 5000])
+    ours = kld_bound(bins, epsilon, delta)
+    exact = stats.chi2.ppf(1 - delta, bins.numpy() - 1) / (2 * epsilon)
+    away = (ours / torch.from_numpy(exact) - 1).abs()
+    assert (away[:4] < 0.031).all() and away[4] < 0.007 and (away[5:] < 4e-4).all()
+    assert kld_bound(torch.tensor(1), epsilon, delta) == 0
+
+
+@pytest.mark.parametrize(("epsilon", "delta"), [(0.05, 0.05), (0.02, 0.2)])
+def test_divergence_is_below_epsilon_as_often_as_promised(epsilon, delta):
+    """A known distribution over 20 bins, 20,000 multinomial draws of the adaptive number.
+
+    The bound takes the likelihood ratio for chi-square; with 15 draws a bin on average it is so to half a percent of
+    probability, which is let off, and 4.5 standard errors: a false alarm in 300,000 tests.
+    """
+    repeats, n = 20_000, 20
+    weights = torch.softmax(0.3 * torch.arange(n, dtype=torch.float64).sin(), -1)
+    cloud = Particles(torch.arange(n, dtype=torch.float64).unsqueeze(-1), weights.log())
+    policy = kld_adaptive(1.0, epsilon, delta, 2, multinomial)
+    count = int(policy.size(cloud, weights, 5000))
+    assert count == math.ceil(kld_bound(torch.tensor(n), epsilon, delta))
+    draws = policy(
+        weights.expand(repeats, n),
+        uniforms(multinomial, repeats, n=count, seed=5),
+        torch.full((repeats,), count),
+        count,
+    )
+    share = torch.zeros(repeats, n).double().scatter_add(-1, draws, torch.ones(repeats, count).double()) / count
+    divergence = torch.special.xlogy(share, share / weights).sum(-1)
+    kept = (divergence <= epsilon).double().mean()
+    error = (delta * (1 - delta) / repeats) ** 0.5
+    assert abs(kept - (1 - delta)) < 4.5 * error + 0.005
+    # Half as many would not do.
+    half = draws[:, torch.randperm(count, generator=torch.Generator().manual_seed(0))[: count // 2]]
+    share = torch.zeros(repeats, n).double().scatter_add(-1, half, torch.ones(half.shape).double()) / half.shape[-1]
+    assert (torch.special.xlogy(share, share / weights).sum(-1) <= epsilon).double().mean() < 0.6
+
+
+def counted(x, widths, heaviest):
+    """Bins that points fall in, one by one."""
+    return len({tuple(math.floor(v / w + 0.5) for v, w in zip(row - heaviest, widths, strict=True)) for row in x})
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("widths", [0.5, (0.5, 2.0, 1.0), (math.inf, 0.7, math.inf), (1e-9, 1e-9, 1e-9)], ids=str)
+def test_occupied_bins_are_counted(widths, dtype):
+    """Against a set of cells, with a grid around the heaviest particle; in the last case 2^90 cells are in the box."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(2, 300, 3, generator=generator, dtype=torch.float64).to(dtype)
+    weights = torch.full((2, 300), 1 / 300, dtype=dtype)
+    weights[0, 17] *= 1.5
+    cloud = Particles(x, weights.log())
+    sized = kld_adaptive(torch.tensor(widths) if isinstance(widths, tuple) else widths).size
+    found = sized.bins(cloud, weights, 1000)
+    each = widths if isinstance(widths, tuple) else (widths,) * 3
+    finite = [k for k in range(3) if each[k] < math.inf]
+    for row, heaviest in ((0, 17), (1, 0)):
+        points = x[row][:, finite]
+        cells = [np.float64(each[k]) for k in finite]
+        centred = (points - points[heaviest]).double().numpy()
+        if dtype == torch.float64 or widths != (1e-9,) * 3:
+            assert found[row] == counted(centred, cells, 0.0)
+    assert torch.equal(sized.bins(cloud._replace(x=x[1], log_weights=weights[1].log()), weights[1], 1000), found[1])
+    order = torch.randperm(300, generator=generator)
+    mixed = sized.bins(Particles(x[0, order], weights[0, order].log()), weights[0, order], 1000)
+    assert mixed == found[0]
+
+
+def test_bins_of_next_to_no_weight_do_not_count():
+    """A bin counts from a share of about 1 / maximum on."""
+    x = torch.arange(4, dtype=torch.float64).unsqueeze(-1)
+    weights = torch.tensor([0.6, 0.39, 0.0099, 0.0001], dtype=torch.float64)
+    sized = kld_adaptive(1.0).size
+    cloud = Particles(x, weights.log())
+    assert [int(sized.bins(cloud, weights, m)) for m in (1, 10, 100, 10_000)] == [1, 2, 3, 4]
+
+
+def test_bins_of_attitudes_are_those_of_rotation_vectors():
+    space = UnitQuaternion()
+    start = torch.tensor([[0.5, 0.5, 0.5, 0.5]], dtype=torch.float64)
+    turns = 0.2 * torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.4, 0, 0]], dtype=torch.float64)
+    x = space.retract(start, turns)
+    weights = torch.tensor([0.3, 0.2, 0.2, 0.2, 0.1], dtype=torch.float64)
+    cloud = Particles(x * torch.tensor([[1], [-1], [1], [-1], [-1]]), weights.log(), None, space)
+    assert kld_adaptive(0.2).size.bins(cloud, weights, 100) == 4
+
+
+def test_counts_lie_between_their_limits():
+    x = torch.stack([torch.zeros(50), torch.linspace(0, 49, 50)]).double().unsqueeze(-1)
+    weights = torch.full((2, 50), 0.02, dtype=torch.float64)
+    sized = kld_adaptive(1.0, 0.5, 0.01, 30).size
+    exact = math.ceil(kld_bound(torch.tensor(50), 0.5, 0.01))
+    assert exact == 75
+    assert sized(Particles(x, weights.log()), weights, 1000).tolist() == [30, 75]
+    assert sized(Particles(x, weights.log()), weights, 60).tolist() == [30, 60]
+
+
+def test_adaptive_resamplers_keep_scheme_and_policy():
+    adaptive = ess_below(0.4, kld_adaptive([1.0, 2.0], 0.1, 0.2, 7, stratified))
+    assert (adaptive.name, adaptive.threshold, adaptive.one_uniform) == ("stratified", 0.4, False)
+    assert adaptive.size == KldSize((1.0, 2.0), 0.1, 0.2, 7)
+    assert kld_adaptive(1.0, resampler=ess_below(0.4)).threshold == 0.4
+    default = kld_adaptive(0.5)
+    assert default.size == KldSize(0.5, 0.05, 0.01, 50) and default.name == "systematic"
+    weights, u = weights_of(9, seed=0), uniforms(systematic, n=9, seed=1)
+    assert torch.equal(default(weights, u), systematic(weights, u))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (dict(bin_widths=0.0), r"bin_widths must be positive.*got \(0\.0,\)"),
+        (dict(bin_widths=math.nan), r"bin_widths must be positive.*got \(nan,\)"),
+        (dict(bin_widths=[1.0, -2.0]), r"bin_widths must be positive.*got \(1\.0, -2\.0\)"),
+        (dict(bin_widths=[math.inf, math.inf]), "not all infinite"),
+        (dict(bin_widths=[]), r"got \(\)"),
+        (dict(bin_widths=torch.ones(2, 2)), "one or one a component"),
+        (dict(bin_widths=1.0, epsilon=0.0), r"epsilon must be positive, got 0\.0"),
+        (dict(bin_widths=1.0, delta=1.0), r"delta must be in \(0, 1\), got 1\.0"),
+        (dict(bin_widths=1.0, minimum=1), "minimum must be at least 2, got 1"),
+    ],
+)
+def test_adaptive_resamplers_refuse_bad_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        kld_adaptive(**arguments)
+
+
+def test_a_scheme_of_fixed_number_can_not_adapt():
+    own = Resampler("own", lambda weights, u: systematic(weights, u), one_uniform=True)
+    with pytest.raises(TypeError, match="the scheme 'own' must take counts and a width"):
+        kld_adaptive(1.0, resampler=own)
+
+
 # Gathering ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.int64])
 @pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 3)])
 @pytest.mark.parametrize("rest", [(), (4,), (4, 2)])
-@pytest.mark.parametrize("n", [1, 9])
-def test_gathered_rows_are_those_of_take_along_dim(dtype, batch, rest, n):
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (9, 9), (9, 4), (3, 8)])
+def test_gathered_rows_are_those_of_take_along_dim(dtype, batch, rest, n, m):
     generator = torch.Generator().manual_seed(0)
     values = (100 * torch.randn(*batch, n, *rest, generator=generator)).to(dtype)
-    ancestors = torch.randint(n, (*batch, n), generator=generator)
+    ancestors = torch.randint(n, (*batch, m), generator=generator)
     index = ancestors.view(*ancestors.shape, *(1 for _ in rest))
     expected = torch.take_along_dim(values, index, len(batch))
     assert torch.equal(gather_particles(values, ancestors), expected)

@@ -1,5 +1,6 @@
 """Collecting what a filter does, step by step, into a history."""
 
+import math
 from typing import Any, Literal
 
 import torch
@@ -23,10 +24,12 @@ class Series:
 
     Args:
         steps: how many there will be at most.
+        axis: of the particles, where there are some; steps with fewer than others are filled up.
+        filling: what with; None for copies of the last one.
     """
 
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
+    def __init__(self, steps: int, axis: int | None = None, filling: float | None = None) -> None:
+        self.steps, self.axis, self.filling = steps, axis, filling
         self.values: list[Tensor] = []
         self.block: Tensor | None = None
         self.count = 0
@@ -48,11 +51,26 @@ class Series:
         """All values, time first; steps whose rows share a value are widened where other steps have one a row."""
         if self.block is not None:
             return self.block[: self.count]
-        shapes = {value.shape for value in self.values}
+        values = self.values
+        if self.axis is not None:
+            most = max(value.shape[self.axis] for value in values)
+            values = [_filled(value, most, self.axis, self.filling) for value in values]
+        shapes = {value.shape for value in values}
         if len(shapes) == 1:
-            return torch.stack(self.values)
+            return torch.stack(values)
         widest = torch.broadcast_shapes(*shapes)
-        return torch.stack([value.expand(widest) for value in self.values])
+        return torch.stack([value.expand(widest) for value in values])
+
+
+def _filled(value: Tensor, most: int, axis: int, filling: float | None) -> Tensor:
+    """With ``most`` particles; one that all share stays one."""
+    n = value.shape[axis]
+    if n in (1, most):
+        return value
+    shape = list(value.shape)
+    shape[axis] = most - n
+    last = value.narrow(axis, n - 1, 1).expand(shape)
+    return torch.cat([value, last if filling is None else last.new_full(shape, filling)], axis)
 
 
 def _block_like(value: Tensor, steps: int) -> Tensor:
@@ -91,7 +109,7 @@ class Recorder:
             self._add_cloud(belief)
         for name, value in zip(info._fields, info, strict=True):
             if isinstance(value, Tensor) and self._wanted(name):
-                self._put(f"info.{name}", value)
+                self._put(f"info.{name}", value, -1 if name == "ancestors" else None)
 
     def _add_cloud(self, belief: Particles) -> None:
         if self.record == "mean":
@@ -101,20 +119,20 @@ class Recorder:
         self._put("mean", mean)
         self._put("covariance", covariance)
         if self.record == "beliefs":
-            self._put("x", belief.x)
-            self._put("log_weights", belief.log_weights)
+            self._put("x", belief.x, -2)
+            self._put("log_weights", belief.log_weights, -1, -math.inf)
             if belief.scale_tril is not None:
-                self._put("scale_tril", belief.scale_tril)
+                self._put("scale_tril", belief.scale_tril, -3)
 
     def _wanted(self, name: str) -> bool:
         if name == "ancestors":
             return self.record == "beliefs"
         return self.record != "mean" or not name.startswith("innovation")
 
-    def _put(self, name: str, value: Tensor) -> None:
+    def _put(self, name: str, value: Tensor, axis: int | None = None, filling: float | None = None) -> None:
         series = self.series.get(name)
         if series is None:
-            series = self.series[name] = Series(self.steps)
+            series = self.series[name] = Series(self.steps, axis, filling)
         series.add(value)
 
     def finish(self, final: FilterState[Any]) -> History:

@@ -18,28 +18,28 @@ def at_positions(weights, positions):
     return [bisect_right(ends, p) for p in sorted(positions)]
 
 
-def systematic(weights, uniforms):
-    n = len(weights)
-    return at_positions(weights, [(i + Fraction(uniforms[0])) / n for i in range(n)])
+def systematic(weights, uniforms, m=None):
+    m = len(weights) if m is None else m
+    return at_positions(weights, [(i + Fraction(uniforms[0])) / m for i in range(m)])
 
 
-def stratified(weights, uniforms):
-    n = len(weights)
-    return at_positions(weights, [(i + Fraction(u)) / n for i, u in enumerate(uniforms)])
+def stratified(weights, uniforms, m=None):
+    m = len(weights) if m is None else m
+    return at_positions(weights, [(i + Fraction(u)) / m for i, u in enumerate(uniforms[:m])])
 
 
-def multinomial(weights, uniforms):
-    return at_positions(weights, [Fraction(u) for u in uniforms])
+def multinomial(weights, uniforms, m=None):
+    return at_positions(weights, [Fraction(u) for u in uniforms[: len(weights) if m is None else m]])
 
 
-def residual(weights, uniforms):
+def residual(weights, uniforms, m=None):
     """Whole copies, then draws from the fractional parts, in the order of the particles."""
-    n = len(weights)
+    m = len(weights) if m is None else m
     total = sum(Fraction(w) for w in weights)
-    shares = [Fraction(w) * n / total for w in weights]
+    shares = [Fraction(w) * m / total for w in weights]
     counts = [int(share) for share in shares]
     rest = [share - count for share, count in zip(shares, counts, strict=True)]
-    left = n - sum(counts)
+    left = m - sum(counts)
     if left:
         for k in at_positions(rest, [Fraction(u) for u in uniforms[:left]]):
             counts[k] += 1

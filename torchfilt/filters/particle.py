@@ -15,7 +15,7 @@ from torchfilt.moves import MetropolisHastings
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
 from torchfilt.proposals import LookAhead, Proposal, Proposed
-from torchfilt.resampling import Resampler, by_component, gather_particles, systematic
+from torchfilt.resampling import KldSize, Resampler, by_component, gather_particles, systematic
 from torchfilt.run import Filter
 from torchfilt.types import FilterState, Missing, Step, StepInfo, StepInput, StepNoise
 
@@ -36,7 +36,7 @@ class ParticleFilter(Filter[Particles]):
 
     Args:
         model: the three laws.
-        particles: n.
+        particles: n; the maximum where the resampler says how many are needed (`kld_adaptive`).
         proposal: `Prior`, `Local` or anything that is a `Proposal`.
         resampler: scheme and policy, such as ``ess_below(0.5)`` or ``systematic`` (always).
         move: `MetropolisHastings`, for proposals that leave points; or None.
@@ -46,7 +46,7 @@ class ParticleFilter(Filter[Particles]):
 
     Raises:
         ValueError: fewer than two particles (pooled redraw: than e + 2), a move or a kernel on particles with
-            covariances.
+            covariances, an adaptive number of particles that does not go with the other parts.
 
         TypeError: not a model, not a resampler.
 
@@ -84,6 +84,9 @@ class ParticleFilter(Filter[Particles]):
                 "a move or a kernel walks on points, this proposal leaves a Gaussian for each particle; "
                 "take Prior() or Local(..., redraw='always', split=0.0, weights='joint')"
             )
+        if resampler.size is not None:
+            fewest = size + 2 if getattr(proposal, "pooled", False) else 2
+            _check_size(resampler.size, particles, size, fewest, move is None and kernel is None)
         self.particles, self.proposal, self.resampler, self.move = particles, proposal, resampler, move
         self.kernel, self.look_ahead, self.fast_normals = kernel, look_ahead, fast_normals
         own = getattr(proposal, "is_exact", None)
@@ -116,6 +119,8 @@ class ParticleFilter(Filter[Particles]):
         """Random numbers of a step, a function of (seed, step) alone."""
         source = NoiseSource(seed, self.fast_normals)
         like, shape = belief.x, belief.x.shape[:-1]
+        if self.resampler.size is not None:  # how many will be used shows only in the step
+            shape = torch.Size([*shape[:-1], self.particles])
         step = step + 1  # zero is the initial draw
         full = (*shape, self.tangent_size)
         generator = source.generator(step, _STEP, like.device)
@@ -163,6 +168,10 @@ class ParticleFilter(Filter[Particles]):
         else:
             belief = by_component(belief)
             ancestors = torch.arange(belief.x.shape[-2], device=belief.x.device).expand_as(belief.log_weights)
+        alive = None
+        if self.resampler.size is not None:
+            alive = _alive(belief)
+            step = step._replace(noise=noise._replace(proposal=_first(noise.proposal, belief)))
         proposed = self.proposal(self.model, belief, step)
         after, log_likelihood, ok = _reweight(belief, proposed)
         rate = None
@@ -170,7 +179,13 @@ class ParticleFilter(Filter[Particles]):
             x, rate = self.move(self.model, belief, after, step)
             after = after._replace(x=x)
         info = StepInfo(
-            log_likelihood, ok, ess=after.ess, ancestors=ancestors, acceptance_rate=rate, evidence=self.evidence
+            log_likelihood,
+            ok,
+            ess=after.ess,
+            ancestors=ancestors,
+            acceptance_rate=rate,
+            particles=alive,
+            evidence=self.evidence,
         )
         return after, info
 
@@ -183,7 +198,7 @@ class ParticleFilter(Filter[Particles]):
         if self.kernel is not None:
             assert step.noise.kernel is not None
             belief = self.kernel(cloud, belief, step.noise.kernel, chosen)
-        return self.proposal.refresh(belief, step.noise.redraw, chosen), ancestors
+        return self.proposal.refresh(belief, _first(step.noise.redraw, belief), chosen), ancestors
 
     def _resample(
         self, belief: Particles, preferred: Tensor, uniforms: Tensor
@@ -195,24 +210,69 @@ class ParticleFilter(Filter[Particles]):
         n = belief.log_weights.shape[-1]
         weights = belief.weights if preferred is belief.log_weights else torch.softmax(preferred, -1)
         weights = weights.detach() if weights.requires_grad else weights
-        if self.resampler.threshold == math.inf:
-            ancestors = self.resampler(weights, uniforms)
-            return _copies(belief, preferred, ancestors, None), ancestors, None
+        policy, counts = self.resampler, None
+        held: Tensor | int = n if policy.size is None else _alive(belief)
+        if policy.threshold == math.inf:
+            if policy.size is not None:
+                counts = policy.size(belief, weights, self.particles)
+            ancestors = policy(weights, uniforms, counts, self._width(counts))
+            return _copies(belief, preferred, ancestors, None, counts, self.particles), ancestors, None
         everyone = torch.arange(n, device=belief.x.device)
-        few = 1 / weights.square().sum(-1) < self.resampler.threshold * n
-        if self.resampler.threshold == 0 or not (torch.compiler.is_compiling() or bool(few.any())):
+        few = 1 / weights.square().sum(-1) < policy.threshold * held
+        if policy.threshold == 0 or not (torch.compiler.is_compiling() or bool(few.any())):
             return by_component(belief), everyone.expand_as(belief.log_weights), torch.zeros_like(few)
-        ancestors = torch.where(few.unsqueeze(-1), self.resampler(weights, uniforms), everyone)
-        return _copies(belief, preferred, ancestors, few), ancestors, few
+        if policy.size is not None:
+            counts = torch.where(few, policy.size(belief, weights, self.particles), held)
+        ancestors = policy(weights, uniforms, counts, self._width(counts))
+        if counts is not None:
+            everyone = torch.arange(ancestors.shape[-1], device=belief.x.device).clamp_max(n - 1)
+        ancestors = torch.where(few.unsqueeze(-1), ancestors, everyone)
+        return _copies(belief, preferred, ancestors, few, counts, self.particles), ancestors, few
+
+    def _width(self, counts: Tensor | None) -> int | None:
+        """Particles that the fullest row has; under the compiler, where no shape may hang on numbers, the maximum."""
+        if counts is None:
+            return None
+        return self.particles if torch.compiler.is_compiling() else int(counts.max())
 
 
-def _copies(belief: Particles, preferred: Tensor, ancestors: Tensor, chosen: Tensor | None) -> Particles:
-    """The ancestors' copies, weighted by what they were preferred beyond their own weight."""
+def _check_size(policy: KldSize, most: int, size: int, fewest: int, alone: bool) -> None:
+    """Raise a ValueError where an adaptive number of particles does not go with the filter's other parts."""
+    if not alone:
+        raise ValueError("a move or a kernel needs a fixed number of particles, kld_adaptive gives a number a row")
+    if not fewest <= policy.minimum <= most:
+        raise ValueError(f"kld_adaptive's minimum must be from {fewest} to particles = {most}, got {policy.minimum}")
+    if isinstance(policy.bin_widths, tuple) and len(policy.bin_widths) != size:
+        raise ValueError(f"bin_widths must be one or one for each of {size} components, got {len(policy.bin_widths)}")
+
+
+def _first(noise: Tensor | None, belief: Particles) -> Tensor | None:
+    """The numbers (*batch, n, e) that the particles there are use; they were drawn for the most there can be."""
+    n = belief.x.shape[-2]
+    return noise if noise is None or noise.shape[-2] == n else noise[..., :n, :]
+
+
+def _alive(belief: Particles) -> Tensor:
+    """How many particles (*batch) a row has, up to the last with a weight."""
+    places = torch.arange(1, belief.log_weights.shape[-1] + 1, device=belief.x.device)
+    return torch.where(belief.log_weights > -math.inf, places, 1).amax(-1)
+
+
+def _copies(
+    belief: Particles, preferred: Tensor, ancestors: Tensor, chosen: Tensor | None, counts: Tensor | None, most: int
+) -> Particles:
+    """The ancestors' copies, weighted by what they were preferred beyond their own weight.
+
+    ``counts`` (*batch): how many of a row's ancestors count, None for all; ``most``: the largest count there can be.
+    """
     x = gather_particles(belief.x, ancestors)
     factor = belief.scale_tril
     if factor is not None and factor.shape[-3] > 1:
         factor = gather_particles(factor, ancestors)
-    log_weights = belief.log_weights.new_full((), -math.log(ancestors.shape[-1])).expand(ancestors.shape)
+    log_weights = belief.log_weights.new_full((), -math.log(ancestors.shape[-1] if counts is None else most))
+    if counts is not None:
+        log_weights = torch.where(counts == most, log_weights, -counts.to(log_weights.dtype).log()).unsqueeze(-1)
+    log_weights = log_weights.expand(ancestors.shape)
     if preferred is not belief.log_weights:
         # Constant in the gradient: what the weights lose by it, the score of the choice gives back.
         choice = torch.log_softmax(preferred, -1).detach()
@@ -222,7 +282,11 @@ def _copies(belief: Particles, preferred: Tensor, ancestors: Tensor, chosen: Ten
         # A particle of weight zero has no ancestor but may stand in the unchosen rows.
         log_weights = log_weights + torch.where(torch.isfinite(score), score - score.detach(), 0)
     if chosen is not None:
-        log_weights = torch.where(chosen.unsqueeze(-1), log_weights, belief.log_weights)
+        own = belief.log_weights if counts is None else belief.log_weights.gather(-1, ancestors)
+        log_weights = torch.where(chosen.unsqueeze(-1), log_weights, own)
+    if counts is not None:
+        places = torch.arange(ancestors.shape[-1], device=x.device)
+        log_weights = torch.where(places < counts.unsqueeze(-1), log_weights, -math.inf)
     return Particles(x, log_weights, factor, belief.space)
 
 
