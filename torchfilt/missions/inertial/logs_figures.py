@@ -117,8 +117,8 @@ def _attitude(results: dict[str, Arrays], settings: LogSettings) -> Any:
         ax.set_ylabel(f"{angle}, deg")
         ax.set_ylim(-1.3 * max(reach), 1.3 * max(reach))
         ax.axvline(tuning.tuned_to_s, color="0.5", lw=0.8, ls=":")
-    axes[0, 0].legend(fontsize=8, ncols=3)
     axes[-1, 0].set_xlabel("time, s (dotted: end of the part that was tuned on)")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     return figure
 
 
@@ -141,6 +141,6 @@ def _consistency(results: dict[str, Arrays], settings: LogSettings) -> Any:
         ax.axvline(TUNING[settings.log].tuned_to_s, color="0.5", lw=0.8, ls=":")
         ax.set_ylabel(key.removeprefix("nis_").replace("_", " "))
         ax.grid(alpha=0.25, lw=0.5, which="both")
-    axes[0, 0].legend(fontsize=8, ncols=3)
     axes[-1, 0].set_xlabel("time, s (dotted: end of the part that was tuned on)")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     return figure
