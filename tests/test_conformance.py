@@ -307,6 +307,9 @@ PARTICLE = {
     "Bootstrap moved, predictive": lambda m: tf.BootstrapFilter(
         m, 40, move=MetropolisHastings(1, 0.5, target="predictive")
     ),
+    "Bootstrap moved, window": lambda m: tf.BootstrapFilter(m, 40, ess_below(0.8), MetropolisHastings(2, window=3)),
+    "Resample-move": lambda m: tf.ResampleMoveParticleFilter(m, 60),
+    "Resample-move, window": lambda m: tf.ResampleMoveParticleFilter(m, 60, window=3),
     "Regularized": lambda m: tf.RegularizedParticleFilter(m, 60),
     "Regularized plain, adaptive": lambda m: tf.RegularizedParticleFilter(
         m, 60, Regularize("epanechnikov", 0.3, keep_moments=False), ess_below(0.5)

@@ -14,6 +14,7 @@ from torchfilt.filters import (
     ParticleFilter,
     RaoBlackwellizedParticleFilter,
     RegularizedParticleFilter,
+    ResampleMoveParticleFilter,
     UnscentedKalmanFilter,
     UnscentedParticleFilter,
 )
@@ -59,6 +60,7 @@ __all__ = [
     "Product",
     "RaoBlackwellizedParticleFilter",
     "RegularizedParticleFilter",
+    "ResampleMoveParticleFilter",
     "StateSpaceModel",
     "StepInfo",
     "StepNoise",

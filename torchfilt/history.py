@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.particles import Particles
+from torchfilt.particles import Particles, PastStep
 from torchfilt.spaces import EUCLIDEAN, Angle, Euclidean, Product, Space, UnitQuaternion
 from torchfilt.storage import NOT_OURS, IntegrityError, read_arrays, write_arrays
 from torchfilt.types import FilterState, StepInfo
@@ -99,6 +99,7 @@ class History:
                 parts |= {f"{prefix}.{name}": named[name] for name in named if isinstance(named[name], Tensor)}
         if isinstance(final, Particles):  # made on another way than from log_weights they differ in the last bit
             parts["final.weights"] = final.weights
+            head["past"] = [_past_to_plain(part, f"final.past.{k}", parts) for k, part in enumerate(final.past)]
         write_arrays(path, {name: value for name, value in parts.items() if value is not None}, head, FILE_KIND)
 
     @classmethod
@@ -164,4 +165,19 @@ def _belief(tensors: dict[str, Tensor], prefix: str, head: dict[str, Any], space
         return Gaussian(own["mean"], own["scale_tril"], space, bool(head["is_diagonal"]))
     log_weights, weights = own["log_weights"], own.get("weights")
     held = None if weights is None else (log_weights, weights)
-    return Particles(own["x"], log_weights, own.get("scale_tril"), space, held)
+    past = head.get("past", []) if prefix == "final" else []
+    steps = tuple(_past_from_plain(plain, f"past.{k}", own) for k, plain in enumerate(past))
+    return Particles(own["x"], log_weights, own.get("scale_tril"), space, held, past=steps)
+
+
+def _past_to_plain(part: PastStep, prefix: str, arrays: dict[str, Tensor | None]) -> dict[str, Any]:
+    """Put a past step's tensors into ``arrays``; what is left of it, ready for JSON."""
+    fields = part._asdict()
+    arrays |= {f"{prefix}.{name}": value for name, value in fields.items() if isinstance(value, Tensor)}
+    return {name: value for name, value in fields.items() if value is not None and not isinstance(value, Tensor)}
+
+
+def _past_from_plain(plain: dict[str, Any], prefix: str, arrays: dict[str, Tensor]) -> PastStep:
+    """The inverse of `_past_to_plain`."""
+    fields: dict[str, Any] = {name: arrays.get(f"{prefix}.{name}", plain.get(name)) for name in PastStep._fields}
+    return PastStep(**fields)

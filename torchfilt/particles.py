@@ -1,7 +1,7 @@
 """A weighted cloud of points, or of small Gaussians."""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,12 +19,34 @@ class Centre(NamedTuple):
     errors: Tensor
 
 
+class PastStep(NamedTuple):
+    """What a move of trajectories keeps of a step that its window reaches back over, in the order of the particles.
+
+    origin (*batch, n, d) is the state the step set out from, noise (*batch, n, e) what it was drawn with, level
+    (*batch, n) the log-density that it adds to the target. mean (*batch, 1, d) and factor (*batch, 1, e, e) fit the
+    cloud that it predicted. None is what the target does not ask for. used (*batch, 1): rows that took the measurement
+    in. y, u, dt and missing as in `torchfilt.types.StepInput`.
+    """
+
+    origin: Tensor
+    noise: Tensor | None
+    level: Tensor
+    mean: Tensor | None
+    factor: Tensor | None
+    used: Tensor
+    y: Tensor
+    u: Tensor | None
+    dt: Tensor | float | None
+    missing: Literal["none", "shared", "rows"]
+
+
 class Particles(NamedTuple):
     """Particles x (*batch, n, d) with normalised log-weights (*batch, n).
 
     scale_tril (*batch, n, e, e), or (*batch, 1, e, e) when all particles share it, makes each particle a Gaussian;
     None means points. ``held`` keeps (log_weights, weights) where the weights were already made, ``centre`` the mean;
     they count only for the very tensors they name, so replacing these is safe.
+    ``past``: earlier steps, oldest first, that a move of trajectories goes back over.
     """
 
     x: Tensor
@@ -33,6 +55,7 @@ class Particles(NamedTuple):
     space: Space = EUCLIDEAN
     held: tuple[Tensor, Tensor] | None = None
     centre: Centre | None = None
+    past: tuple[PastStep, ...] = ()
 
     @property
     def weights(self) -> Tensor:
@@ -112,4 +135,4 @@ def uniform_log_weights(shape: torch.Size | tuple[int, ...], like: Tensor) -> Te
     return torch.full(shape, -math.log(shape[-1]), dtype=like.dtype, device=like.device)
 
 
-__all__ = ["Particles", "second_moment", "uniform_log_weights", "weighted_sum"]
+__all__ = ["Particles", "PastStep", "second_moment", "uniform_log_weights", "weighted_sum"]

@@ -20,12 +20,18 @@ Weights = Literal["marginal", "joint"]
 
 
 class Proposed(NamedTuple):
-    """Particles after the measurement, x (*batch, n, d), with factors or None, and what their log-weights gain."""
+    """Particles after the measurement, x (*batch, n, d), with factors or None, and what their log-weights gain.
+
+    arrival: the transition law at the particles before; log_likelihood (*batch, n) of x. Where a proposal has made
+    them, nobody needs to make them again.
+    """
 
     x: Tensor
     scale_tril: Tensor | None
     log_weight: Tensor
     space: Space
+    arrival: Conditional | None = None
+    log_likelihood: Tensor | None = None
 
 
 class Proposal(Protocol):
@@ -82,12 +88,13 @@ class Prior:
 
     def __call__(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> Proposed:
         """Shapes as in `Local`."""
-        x, space = particles.x, particles.space
+        x, space, law = particles.x, particles.space, None
         if step.move:
             assert step.noise.proposal is not None
             law = model.conditional("transition", x, step.u, step.dt)
             x, space = sample(law, step.noise.proposal, step.noise.seed), _next_space(law, space)
-        return Proposed(x, None, log_likelihood(model, x, step), space)
+        likelihood = log_likelihood(model, x, step)
+        return Proposed(x, None, likelihood, space, law, likelihood)
 
 
 @dataclass(frozen=True)
@@ -274,8 +281,9 @@ class Local:
         assert step.noise.proposal is not None
         x = posterior.sample(step.noise.proposal)
         ratio = log_prob(arrival, x, "none") - posterior.log_prob(x)
-        log_weight = log_likelihood(model, x, step) + ratio
-        return Proposed(x, None if self.split == 0 else posterior.scale_tril, log_weight, posterior.space)
+        likelihood = log_likelihood(model, x, step)
+        factor = None if self.split == 0 else posterior.scale_tril
+        return Proposed(x, factor, likelihood + ratio, posterior.space, arrival, likelihood)
 
     def _predict(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> tuple[Gaussian, Conditional]:
         """Predicted Gaussians, and the law that joint weights are made with: the transition itself for points."""

@@ -20,7 +20,7 @@ from torchfilt.gaussian import Gaussian
 from torchfilt.laws import AdditiveGaussian, LinearGaussian, call_style
 from torchfilt.model import as_gaussian
 from torchfilt.moments import Rule, predict, update
-from torchfilt.particles import Particles
+from torchfilt.particles import Particles, PastStep
 from torchfilt.resampling import Resampler
 from torchfilt.run import Filter
 from torchfilt.spaces import Angle, Space
@@ -496,6 +496,7 @@ def _belief_row(belief: Any, k: int) -> Any:
         x=belief.x[k : k + 1],
         log_weights=belief.log_weights[k : k + 1],
         scale_tril=None if factor is None else factor[k : k + 1],
+        past=tuple(PastStep(*(_row(value, k) for value in part)) for part in belief.past),
     )
 
 
@@ -503,15 +504,12 @@ def _noise_row(noise: StepNoise, k: int) -> StepNoise:
     def first(part: Tensor | None) -> Tensor | None:
         return None if part is None else part[k : k + 1]
 
-    def second(part: Tensor | None) -> Tensor | None:
-        return None if part is None else part[:, k : k + 1]
-
     return noise._replace(
         proposal=first(noise.proposal),
         resampling=noise.resampling[k : k + 1],
         redraw=first(noise.redraw),
-        move_normal=second(noise.move_normal),
-        move_uniform=second(noise.move_uniform),
+        move_normal=None if noise.move_normal is None else noise.move_normal[:, :, k : k + 1],
+        move_uniform=None if noise.move_uniform is None else noise.move_uniform[:, k : k + 1],
         kernel=first(noise.kernel),
     )
 

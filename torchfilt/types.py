@@ -46,8 +46,8 @@ class StepNoise(NamedTuple):
     """Random numbers of one step, drawn outside so that the step itself is a pure function.
 
     proposal (*batch, n, e) standard normals or None; resampling (*batch, k) uniforms; redraw (*batch, n, e) or None;
-    move_normal (moves, *batch, n, e) and move_uniform (moves, *batch, n), or None; kernel (*batch, n, k) normals of a
-    regularisation, or None; seed: for laws that draw by themselves.
+    move_normal (moves, states, *batch, n, e) and move_uniform (moves, *batch, n), or None; kernel (*batch, n, k)
+    normals of a regularisation, or None; seed: for laws that draw by themselves.
     """
 
     proposal: Tensor | None

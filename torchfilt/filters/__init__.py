@@ -16,6 +16,7 @@ from torchfilt.filters.particle_methods import (
     LocallyLinearizedParticleFilter,
     RaoBlackwellizedParticleFilter,
     RegularizedParticleFilter,
+    ResampleMoveParticleFilter,
     UnscentedParticleFilter,
 )
 
@@ -32,6 +33,7 @@ __all__ = [
     "ParticleFilter",
     "RaoBlackwellizedParticleFilter",
     "RegularizedParticleFilter",
+    "ResampleMoveParticleFilter",
     "UnscentedKalmanFilter",
     "UnscentedParticleFilter",
 ]

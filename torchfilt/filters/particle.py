@@ -14,7 +14,7 @@ from torchfilt.model import Conditional, StateSpaceModel, check_batch
 from torchfilt.moves import MetropolisHastings
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
-from torchfilt.proposals import LookAhead, Proposal, Proposed
+from torchfilt.proposals import LookAhead, Prior, Proposal, Proposed
 from torchfilt.resampling import KldSize, Resampler, by_component, gather_particles, systematic
 from torchfilt.run import Filter
 from torchfilt.types import FilterState, Missing, Step, StepInfo, StepInput, StepNoise
@@ -39,15 +39,17 @@ class ParticleFilter(Filter[Particles]):
         particles: n; the maximum where the resampler says how many are needed (`kld_adaptive`).
         proposal: `Prior`, `Local` or anything that is a `Proposal`.
         resampler: scheme and policy, such as ``ess_below(0.5)`` or ``systematic`` (always).
-        move: `MetropolisHastings`, for proposals that leave points; or None.
+        move: `MetropolisHastings`, for proposals that leave points; or None. A window of several states goes with no
+            kernel, which would break the link between a state and the one before, and on the predictive target with
+            `Prior` only, whose noise it replays.
         kernel: `Regularize`, which draws resampled particles anew; for proposals that leave points; or None.
         look_ahead: `LookAhead`, resample by the measurement that comes next; or None.
         fast_normals: draw float64 normals as float32 and cast them: 2.7 times cheaper, 24 bits fine.
 
     Raises:
-        ValueError: fewer than two particles (pooled redraw: than e + 2), a move or a kernel on particles with
-            covariances, an adaptive number of particles that does not go with the other parts.
-
+        ValueError: fewer than two particles (pooled redraw: than e + 2; matched move: than 2 e + 2), a move or a kernel
+            on particles with covariances, a window of several states with a kernel or another proposal (see ``move``),
+            an adaptive number of particles that does not go with the other parts.
         TypeError: not a model, not a resampler.
 
     Source: Scibior and Wood, Differentiable particle filtering without modifying the forward pass (2021), for the
@@ -87,13 +89,15 @@ class ParticleFilter(Filter[Particles]):
         if resampler.size is not None:
             fewest = size + 2 if getattr(proposal, "pooled", False) else 2
             _check_size(resampler.size, particles, size, fewest, move is None and kernel is None)
+        if move is not None:
+            _check_move(move, proposal, kernel, particles, size)
         self.particles, self.proposal, self.resampler, self.move = particles, proposal, resampler, move
         self.kernel, self.look_ahead, self.fast_normals = kernel, look_ahead, fast_normals
         own = getattr(proposal, "is_exact", None)
         linear = own(model, size) if own else model.is_linear() and isinstance(model.initial(), Gaussian)
         # Where linearisation leaves nothing out, a bank of Gaussians is a proper importance sampler.
         self.evidence = "unbiased" if linear and proposal.evidence == "linearized" else proposal.evidence
-        if kernel is not None:
+        if kernel is not None or (move is not None and move.target == "predictive"):
             self.evidence = "approximate"
 
     def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[Particles]:
@@ -131,7 +135,8 @@ class ParticleFilter(Filter[Particles]):
         if self.kernel is not None:
             kernel = source.normal((*shape, self.kernel.normals(self.tangent_size)), step, _KERNEL, like)
         if self.move is not None:
-            normal = source.normal((self.move.steps, *full), step, _MOVE, like)
+            states = self.move.drawn_states(len(belief.past))
+            normal = source.normal((self.move.steps, states, *full), step, _MOVE, like)
             uniform = source.uniform((self.move.steps, *shape), step, _ACCEPT, like)
         return StepNoise(
             source.next_normal(full, generator, like) if self.proposal.draws_at_once else None,
@@ -176,8 +181,8 @@ class ParticleFilter(Filter[Particles]):
         after, log_likelihood, ok = _reweight(belief, proposed)
         rate = None
         if self.move is not None and predict:
-            x, rate = self.move(self.model, belief, after, step)
-            after = after._replace(x=x)
+            known = proposed.arrival, proposed.log_likelihood
+            after, rate = self.move(self.model, belief, after, step, *known, used=ok)
         info = StepInfo(
             log_likelihood,
             ok,
@@ -195,6 +200,8 @@ class ParticleFilter(Filter[Particles]):
         if self.look_ahead is not None:
             preferred = self.look_ahead(self.model, belief, step)
         belief, ancestors, chosen = self._resample(belief, preferred, step.noise.resampling)
+        if self.move is not None:
+            belief = belief._replace(past=self.move.follow(cloud.past, ancestors))
         if self.kernel is not None:
             assert step.noise.kernel is not None
             belief = self.kernel(cloud, belief, step.noise.kernel, chosen)
@@ -244,6 +251,28 @@ def _check_size(policy: KldSize, most: int, size: int, fewest: int, alone: bool)
         raise ValueError(f"kld_adaptive's minimum must be from {fewest} to particles = {most}, got {policy.minimum}")
     if isinstance(policy.bin_widths, tuple) and len(policy.bin_widths) != size:
         raise ValueError(f"bin_widths must be one or one for each of {size} components, got {len(policy.bin_widths)}")
+
+
+def _check_move(
+    move: MetropolisHastings, proposal: Proposal, kernel: Regularize | None, particles: int, size: int
+) -> None:
+    """Raise a ValueError where a window's states would not follow from one another, or a match is impossible."""
+    if move.matched and particles < 2 * size + 2:
+        raise ValueError(
+            f"a matched move in {size} dimensions needs at least {2 * size + 2} particles, got {particles}"
+        )
+    if move.window == 1:
+        return
+    if kernel is not None:
+        raise ValueError(
+            f"a kernel breaks the link between a state and the one before, which a window of {move.window} states "
+            "needs: take window=1 or kernel=None"
+        )
+    if move.target == "predictive" and not isinstance(proposal, Prior):
+        raise ValueError(
+            f"a predictive window of {move.window} states replays the noise that Prior() drew with, the proposal is "
+            f"{proposal!r}: take Prior(), window=1 or target='transition'"
+        )
 
 
 def _first(noise: Tensor | None, belief: Particles) -> Tensor | None:

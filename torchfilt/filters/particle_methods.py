@@ -6,7 +6,7 @@ from torchfilt.filters.particle import ParticleFilter
 from torchfilt.kernels import Regularize
 from torchfilt.model import StateSpaceModel
 from torchfilt.moments import Rule, taylor, unscented
-from torchfilt.moves import MetropolisHastings
+from torchfilt.moves import MetropolisHastings, Target
 from torchfilt.proposals import Local, LookAhead, Prior, Redraw, Weights
 from torchfilt.rao_blackwell import RaoBlackwellized
 from torchfilt.resampling import Resampler, ess_below, systematic
@@ -116,3 +116,34 @@ def RaoBlackwellizedParticleFilter(
     Source: Schon, Gustafsson, Nordlund, IEEE TSP 53 (2005).
     """
     return ParticleFilter(model, particles, RaoBlackwellized(drawn, rule or taylor()), resampler or ess_below(0.5))
+
+
+def ResampleMoveParticleFilter(
+    model: StateSpaceModel,
+    particles: int = 1000,
+    window: int = 1,
+    steps: int = 1,
+    scale: float | None = None,
+    target: Target = "predictive",
+    kernel: Regularize | None = None,
+    resampler: Resampler = systematic,
+    fast_normals: bool = False,
+) -> ParticleFilter:
+    """A bootstrap filter that moves the last ``window`` states of each particle together after every measurement.
+
+    On the predictive target the kernel of a regularised filter becomes a proposal: a shrinking step at the start of the
+    window, its normals matched to the cloud; the states after it are resampled locally, by their own noise, and the
+    measurements of the window accept or refuse the whole. With a single state a kernel that keeps the moments follows
+    each resampling as well, `Regularize()` where ``kernel`` is None; longer windows go with none. On the target
+    "transition", the literal density, which is of no use where process noise is singular, None means no kernel.
+
+    Arguments as in `torchfilt.moves.MetropolisHastings` and `ParticleFilter`.
+
+    Sources: Gilks and Berzuini, Following a moving target, JRSS B 63 (2001); Musso, Oudjane, Le Gland, Improving
+    regularised particle filters (2001).
+    """
+    predictive = target == "predictive"
+    if kernel is None and predictive and window == 1:
+        kernel = Regularize()
+    move = MetropolisHastings(steps, scale, target, window, matched=predictive)
+    return ParticleFilter(model, particles, Prior(), resampler, move, fast_normals, kernel=kernel)
