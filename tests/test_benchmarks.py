@@ -41,8 +41,8 @@ def test_script_runs_and_writes_its_numbers(script, tmp_path):
 def test_regress_bootstrap_step_needs_few_calls(bench):
     # Below 5,000 particles the number of calls is the cost of a step. The goal is 45 with views, which only dispatch:
     # reached without them. The second number is what was last measured, so that it can only fall. In double precision
-    # the normals are made in nine more calls, in half the time.
-    for dtype, more, with_views in ((torch.float32, 0, 59), (torch.float64, 9, 76)):
+    # the normals are made in nine more calls, in half the time, and particles gathered with a view more, in a fifth.
+    for dtype, more, with_views in ((torch.float32, 0, 59), (torch.float64, 9, 77)):
         calls, views = bench.particle_calls(dtype)
         assert 0 < views < calls
         assert calls - views <= 45 + more

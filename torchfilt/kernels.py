@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchfilt.linalg import steady_triangularize
 from torchfilt.particles import Particles
+from torchfilt.resampling import gather_particles
 from torchfilt.spaces import weighted_sum
 
 Shape = Literal["gaussian", "epanechnikov"]
@@ -84,7 +85,12 @@ class Regularize:
         return size + _EXTRA if self.shape == "epanechnikov" else size
 
     def __call__(
-        self, cloud: Particles, resampled: Particles, noise: Tensor, chosen: Tensor | None = None
+        self,
+        cloud: Particles,
+        resampled: Particles,
+        noise: Tensor,
+        chosen: Tensor | None = None,
+        ancestors: Tensor | None = None,
     ) -> Particles:
         """Smooth.
 
@@ -93,6 +99,7 @@ class Regularize:
             resampled: x (*batch, n, d).
             noise: standard normals (*batch, n, k) with k of `normals`.
             chosen: (*batch), rows that were resampled; None for all.
+            ancestors: (*batch, n), of the resampled particles where known: their errors need not be found again.
         """
         space, cloud = cloud.space, cloud.with_centre()
         assert cloud.centre is not None
@@ -100,9 +107,11 @@ class Regularize:
         whole = _factor(cloud.centre.errors, cloud.weights)
         size = whole.shape[-1]
         h = self.bandwidth or optimal_bandwidth(size, resampled.x.shape[-2], self.shape, self.multimodal)
-        step = h * (whole @ self._unit(noise, size).mT).mT
+        step = ((h * whole) @ self._unit(noise, size).mT).mT
         if self.keep_moments:
-            drawn = (1 - h**2) ** 0.5 * space.local(mean, resampled.x) + step
+            known = cloud.centre.errors
+            apart = space.local(mean, resampled.x) if ancestors is None else gather_particles(known, ancestors)
+            drawn = torch.add(step, apart, alpha=(1 - h**2) ** 0.5)
             x = space.retract(mean, _match(drawn, resampled.weights, whole))
         else:
             x = space.retract(resampled.x, step)

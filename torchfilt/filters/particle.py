@@ -183,6 +183,8 @@ class ParticleFilter(Filter[Particles]):
         if self.move is not None and predict:
             known = proposed.arrival, proposed.log_likelihood
             after, rate = self.move(self.model, belief, after, step, *known, used=ok)
+        if self.kernel is not None:
+            after = after.with_centre()  # the next step needs it, as whoever records the mean does
         info = StepInfo(
             log_likelihood,
             ok,
@@ -204,7 +206,7 @@ class ParticleFilter(Filter[Particles]):
             belief = belief._replace(past=self.move.follow(cloud.past, ancestors))
         if self.kernel is not None:
             assert step.noise.kernel is not None
-            belief = self.kernel(cloud, belief, step.noise.kernel, chosen)
+            belief = self.kernel(cloud, belief, step.noise.kernel, chosen, ancestors)
         return self.proposal.refresh(belief, _first(step.noise.redraw, belief), chosen), ancestors
 
     def _resample(
