@@ -1,0 +1,117 @@
+#!/usr/bin/env python
+"""Navigate by inertial sensors and fixes, with classical, regularised and
+Metropolis-Hastings particle filters on the same data, or on real logs.
+
+A simulated reconnaissance flight (sins-sar and its variants) or a logged one
+goes through each filter, all Monte-Carlo runs as one batch. The run folder
+receives metrics.json, table.txt, figures and the stages from which an
+interrupted run goes on.
+"""
+
+import sys
+from typing import Any
+
+from _command import UsageError, add_output_options, check_folder, new_parser, run_command
+from jsonargparse import ArgumentParser
+
+SCENARIOS = ("sins-sar", "mems", "heading-unknown", "outliers")
+FILTERS = (
+    "es-kf",
+    "es-kf-gated",
+    "es-kf-open",
+    "ckf",
+    "bank-36",
+    "sir",
+    "rpf-plain",
+    "rpf",
+    "mpf",
+    "mpf-window",
+    "mpf-literal",
+    "rbpf",
+)
+
+EXAMPLES = """\
+examples:
+  the study: ten filters, 8 runs of 1000 s
+    run_inertial.py
+  where particles earn their keep: heading off by 60 deg, no heading fix
+    run_inertial.py --scenario heading-unknown --particles 5000 \\
+      --out runs/heading
+  only two filters, more particles
+    run_inertial.py --filters es-kf,rpf --particles 10000 --out runs/many
+
+exit codes: 0 done, 1 failed, 2 wrong use, 130 or 143 stopped by SIGINT or
+SIGTERM; finished stages are kept.
+"""
+
+
+def build_parser() -> ArgumentParser:
+    """All options; nothing heavy is imported here, so that --help answers at once."""
+    parser = new_parser("run_inertial.py", __doc__, EXAMPLES)
+
+    group = parser.add_argument_group("Study")
+    group.add_argument(
+        "--scenario",
+        default="sins-sar",
+        choices=SCENARIOS,
+        help="sins-sar: tactical sensors, as in the study; mems: micromachined ones; heading-unknown: heading off by "
+        "60 deg and no heading fix; outliers: 15 %% of the fixes with ten times their noise",
+    )
+    group.add_argument(
+        "--filters", type=str | None, metavar="A,B", help=f"out of {','.join(FILTERS)}; what the scenario is about"
+    )
+    group.add_argument("--runs", default=8, type=int, metavar="R", help="Monte-Carlo runs, one batch")
+    group.add_argument("--seed", default=0, type=int, help="of sensor noise, start errors and particles")
+    group.add_argument("--steps", default=1000, type=int, help="fixes, a second apart; at most 1000")
+    group.add_argument("--particles", default=2000, type=int, metavar="N", help="of the particle filters")
+    group.add_argument(
+        "--conditional-particles", default=1000, type=int, metavar="N", help="of the Rao-Blackwellised one"
+    )
+    group.add_argument("--window", default=5, type=int, metavar="L", help="states that trajectory moves look back on")
+
+    add_output_options(parser, "runs/inertial")
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run and return the exit code."""
+    options = build_parser().parse_args(sys.argv[1:] if arguments is None else arguments).as_dict()
+    return run_command("run_inertial.py", options, _run)
+
+
+def _run(options: dict[str, Any]) -> None:
+    names = None
+    if options["filters"] is not None:
+        names = [name.strip() for name in options["filters"].split(",") if name.strip()]
+        unknown = [name for name in names if name not in FILTERS]
+        if unknown or not names:
+            raise UsageError(f"--filters takes {','.join(FILTERS)}; got {','.join(unknown) or 'none'}")
+    folder = check_folder(options)
+
+    import torch
+
+    from torchfilt.missions.inertial import InertialSettings, run_inertial
+    from torchfilt.missions.stages import Stages
+
+    own = ("scenario", "runs", "seed", "steps", "particles", "conditional_particles", "window")
+    try:
+        settings = InertialSettings(**{name: options[name] for name in own})
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    if options["threads"] is not None:
+        torch.set_num_threads(options["threads"])
+    if options["force"]:
+        Stages(folder / "stages").clear()
+    quiet = options["quiet"]
+    run_inertial(
+        settings,
+        folder,
+        names,
+        say=(lambda line: None) if quiet else (lambda line: print(line, flush=True)),
+        progress=not quiet,
+        figures=options["figures"],
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

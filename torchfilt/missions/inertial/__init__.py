@@ -1,0 +1,17 @@
+"""The SINS/SAR study on the 16-state error model, and inertial navigation on real logs."""
+
+from torchfilt.missions.inertial.scene import FILTERS, SCENARIOS, InertialSettings, Scene, make_filter, make_scene
+from torchfilt.missions.inertial.study import run_filter, run_inertial, summarize, table
+
+__all__ = [
+    "FILTERS",
+    "SCENARIOS",
+    "InertialSettings",
+    "Scene",
+    "make_filter",
+    "make_scene",
+    "run_filter",
+    "run_inertial",
+    "summarize",
+    "table",
+]
