@@ -205,6 +205,8 @@ def test_bad_arguments_are_refused():
         RaoBlackwellized([-1])
     with pytest.raises(TypeError, match=r"rule must be a moment rule.*got 'taylor'"):
         RaoBlackwellized([0], "taylor")
+    with pytest.raises(ValueError, match=r"all particles of a row needs rule=taylor\(\)"):
+        RaoBlackwellized([0], cubature(), shared=True)
     with pytest.raises(ValueError, match="expanded about itself"):
         RaoBlackwellized([0], taylor([1.0, 2.0]))
     with pytest.raises(ValueError, match=r"error components of the state, 0 to 1, got \[0, 2\]"):

@@ -38,7 +38,9 @@ class RaoBlackwellized:
 
     A factor that no particle touches is carried once a row, (*batch, 1, e, e): with linear laws, and where a law's
     ``first_order(x, u, dt) -> (Gaussian, jacobian (..., m, e))`` leaves the particle axis away in noise and jacobian
-    or gives it the length 1. Columns of the jacobian that belong to drawn components are not looked at.
+    or gives it the length 1. Columns of the jacobian that belong to drawn components are not looked at. ``shared``
+    makes it one factor a row for any laws: only means are then taken at each particle, derivatives and noise at the
+    mean of the row. Where these hardly depend on the particle it is many times faster and hardly less exact.
 
     Drawn components may be singular: what the earlier ones determine is not drawn again. Particles without a
     covariance are points and go on as in `Prior`; nothing else is left where everything is drawn.
@@ -46,11 +48,12 @@ class RaoBlackwellized:
     Args:
         drawn: error components to draw, a slice or indices.
         rule: moment rule for the others; expands about each particle.
+        shared: see above; with `taylor()`.
 
     Raises:
         TypeError: drawn holds something that is not an index; not a moment rule.
-        ValueError: negative or repeated indices, a rule that expands about a point of its own; later, indices that the
-            state does not have, a quadrature with a negative weight.
+        ValueError: negative or repeated indices, a rule that expands about a point of its own, shared with another rule
+            than `taylor()`; later, indices that the state does not have, a quadrature with a negative weight.
 
     Sources: Schon, Gustafsson, Nordlund, Marginalized particle filters for mixed linear/nonlinear state-space models,
         IEEE TSP 53 (2005); Doucet, Godsill, Andrieu, Statistics and Computing 10 (2000), section IV.
@@ -58,6 +61,7 @@ class RaoBlackwellized:
 
     drawn: slice | Sequence[int]
     rule: Rule = field(default_factory=taylor)
+    shared: bool = False
     evidence: Evidence = "linearized"
     draws_at_once: bool = True
     needs_redraw_noise: bool = False
@@ -67,6 +71,8 @@ class RaoBlackwellized:
         check_rule_type(self.rule)
         if isinstance(self.rule, Taylor) and self.rule.about is not None:
             raise ValueError("each particle is expanded about itself: the rule must be taylor() without a point")
+        if self.shared and not isinstance(self.rule, Taylor):
+            raise ValueError("one set of derivatives for all particles of a row needs rule=taylor()")
         if isinstance(self.drawn, slice):
             return
         drawn = tuple(self.drawn)
@@ -86,8 +92,9 @@ class RaoBlackwellized:
         linear = set(_parts(self.drawn, size).linear)
         if not linear:
             return True
-        laws = (model.transition, model.observation)
-        return isinstance(model.initial(), Gaussian) and all(linear <= _linear_in(law, size) for law in laws)
+        if not isinstance(model.initial(), Gaussian) or (self.shared and not model.is_linear()):
+            return False
+        return all(linear <= _linear_in(law, size) for law in (model.transition, model.observation))
 
     def start(self, initial: Conditional, draws: Tensor, noise: Tensor) -> Particles:
         """Drawn components of n particles and the Gaussian that is left of the others.
@@ -125,11 +132,14 @@ class RaoBlackwellized:
         parts = _parts(self.drawn, particles.scale_tril.shape[-1])
         factor = parts.take(parts.take(particles.scale_tril, -1), -2)
         belief = Gaussian(particles.x, factor, _Section(particles.space, parts))
-        rule, space = _PartRule(self.rule, parts), particles.space
+        rule, space = _PartRule(self.rule, parts, None), particles.space
+        if self.shared:
+            rule = rule._replace(centre=particles.mean.unsqueeze(-2))
         if step.move:
             assert step.noise.proposal is not None
-            line = rule.linearize(model.moments("transition"), belief, step.u, step.dt)
+            line, ahead = rule.with_centre(model.moments("transition"), belief, step.u, step.dt)
             belief, space = _move(line, belief, step.noise.proposal)
+            rule = rule._replace(centre=ahead)
         sensor = model.moments("observation")
         result = update(sensor, belief, step.y, rule, step.missing, u=step.u, dt=step.dt)
         posterior = result.belief
@@ -269,13 +279,29 @@ class _Section(NamedTuple):
 
 
 class _PartRule(NamedTuple):
-    """A moment rule for the linear components; what a law gives without a particle axis stays without one."""
+    """A moment rule for the linear components; what a law gives without a particle axis stays without one.
+
+    ``centre`` (*batch, 1, d): where derivatives and noise are taken for all particles of a row; None for at each.
+    """
 
     rule: Rule
     parts: _Parts
+    centre: Tensor | None
 
     def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
         """See `Linearization`; the slope is that of the linear components."""
+        return self.with_centre(law, belief, u, dt)[0]
+
+    def with_centre(
+        self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None
+    ) -> tuple[Linearization, Tensor | None]:
+        """The same, and where the law takes the centre."""
+        if self.centre is None:
+            return self._at(law, belief, u, dt), None
+        line = self._at(law, belief._replace(mean=self.centre), u, dt)
+        return line._replace(mean=law(belief.mean, u, dt).mean), line.space.project(line.mean)
+
+    def _at(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
         form = getattr(law, "linear_form", None)
         first_order = getattr(law, "first_order", None) if isinstance(self.rule, Taylor) else None
         if form is not None:

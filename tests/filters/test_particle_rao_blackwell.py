@@ -154,16 +154,61 @@ def test_a_shared_covariance_is_carried_once_a_row(place):
             np.testing.assert_allclose(getattr(other, name), getattr(shared, name), rtol=0, atol=1e-11)
 
 
-def test_a_particle_that_cannot_move_loses_its_weight_and_not_the_sharing():
+def test_derivatives_at_the_rows_mean_are_shared_by_all_its_particles():
+    """Laws as plain functions: the same numbers where the matrices are the same everywhere, with two QRs a row."""
+    ys = replicate(mixed_series(6), 3).clone()
+    ys[1, 0, 0] = ys[2, 1] = torch.nan
+    model = plain_model()
+    each = tf.RaoBlackwellizedParticleFilter(model, 50, drawn=[0])(ys, seed=8)
+    filter = tf.RaoBlackwellizedParticleFilter(model, 50, drawn=[0], shared=True)
+    with Matrices() as matrices:
+        one = filter(ys, seed=8, record="beliefs")
+    assert matrices.count["qr"] == 1 + 6 * 3 * 2 and one.beliefs.scale_tril.shape == (6, 3, 1, 4, 4)
+    for name in ("mean", "covariance", "log_likelihood"):
+        np.testing.assert_allclose(getattr(one, name), getattr(each, name), rtol=0, atol=1e-11)
+    first = filter(ys, seed=8, predict_first=False)
+    assert first.final.belief.scale_tril.shape == (3, 1, 4, 4) and first.diagnostics.ok.all()
+    linear = tf.RaoBlackwellizedParticleFilter(state_space(PLANE), 30, drawn=[0], shared=True)
+    assert linear.evidence == "unbiased" and filter.evidence == "linearized"
+    declared = tf.RaoBlackwellizedParticleFilter(mixed_model(), 30, drawn=[0], shared=True)
+    assert declared.evidence == "linearized"
+
+
+def test_shared_derivatives_are_those_at_the_mean():
+    """A slope that depends on the drawn component: means of each particle, one gain, by hand."""
+    model = tf.StateSpaceModel(
+        gaussian(tensor([0.0, 1.0]), tensor([[0.5, 0.0], [0.0, 2.0]])),
+        tf.AdditiveGaussian(lambda x: torch.stack([x[..., 0], x[..., 0].sin() * x[..., 1]], -1), 0.1 * torch.eye(2)
+                            .double()),
+        tf.AdditiveGaussian(lambda x: x[..., :1].cos() * x[..., 1:], tensor([[0.3]])),
+    )  # fmt: skip
+    filter = tf.RaoBlackwellizedParticleFilter(model, 40, drawn=[0], shared=True)
+    state = filter.init((), 3)
+    x, noise = state.belief.x, filter.draw(state.belief, 0, 3)
+    after, info = filter.advance(state.belief, tensor([0.7]), None, None, noise, "none")
+    centre = x.mean(0)
+    drawn = x[:, 0] + 0.1**0.5 * noise.proposal[:, 0]
+    m, P = x[:, 0].sin() * x[:, 1], centre[0].sin() ** 2 * 2.0 + 0.1
+    H = centre[0].cos()
+    S = H**2 * P + 0.3
+    residual = 0.7 - drawn.cos() * m
+    np.testing.assert_allclose(after.x[:, 0], drawn, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(after.x[:, 1], m + P * H / S * residual, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(after.scale_tril[0, 1, 1] ** 2, P - (P * H) ** 2 / S, rtol=1e-12)
+    log = -0.5 * residual**2 / S - 0.5 * (2 * np.pi * S).log()
+    np.testing.assert_allclose(info.log_likelihood, log.exp().mean().log(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_particle_that_cannot_move_loses_its_weight_and_not_the_sharing(shared):
     class Bounded(Motion):
         def forward(self, x):
             law = super().forward(x)
             return law._replace(mean=torch.where(x[..., :1] > 0.8, torch.nan, law.mean))
 
     model = mixed_model()
-    filter = tf.RaoBlackwellizedParticleFilter(
-        tf.StateSpaceModel(model.initial, Bounded(), model.observation), 30, drawn=[0]
-    )
+    model = tf.StateSpaceModel(model.initial, Bounded(), model.observation)
+    filter = tf.RaoBlackwellizedParticleFilter(model, 30, drawn=[0], shared=shared)
     state = filter.init((2,), 1)
     for y in mixed_series(3):
         state, info = filter.step(state, y.expand(2, 2))

@@ -107,15 +107,18 @@ def RaoBlackwellizedParticleFilter(
     *,
     drawn: slice | Sequence[int],
     rule: Rule | None = None,
+    shared: bool = False,
     resampler: Resampler | None = None,
 ) -> ParticleFilter:
     """Particles over the ``drawn`` error components, each with a Gaussian over the others.
 
-    Everything drawn, ``slice(None)``, is the bootstrap filter, nothing, ``()``, the Gaussian filter of ``rule``.
+    Everything drawn, ``slice(None)``, is the bootstrap filter, nothing, ``()``, the Gaussian filter of ``rule``. With
+    ``shared`` all particles of a row have the derivatives at its mean, and one covariance.
 
     Source: Schon, Gustafsson, Nordlund, IEEE TSP 53 (2005).
     """
-    return ParticleFilter(model, particles, RaoBlackwellized(drawn, rule or taylor()), resampler or ess_below(0.5))
+    proposal = RaoBlackwellized(drawn, rule or taylor(), shared)
+    return ParticleFilter(model, particles, proposal, resampler or ess_below(0.5))
 
 
 def ResampleMoveParticleFilter(
