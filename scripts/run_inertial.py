@@ -14,7 +14,7 @@ from typing import Any
 from _command import UsageError, add_output_options, check_folder, new_parser, run_command
 from jsonargparse import ArgumentParser
 
-SCENARIOS = ("sins-sar", "mems", "heading-unknown", "outliers")
+SCENARIOS = ("sins-sar", "mems", "heading-unknown", "outliers", "uav", "car")
 FILTERS = (
     "es-kf",
     "es-kf-gated",
@@ -29,6 +29,11 @@ FILTERS = (
     "mpf-literal",
     "rbpf",
 )
+# Of the logged drives: filters with and without what helps them.
+VARIANTS = {
+    "uav": ("es-kf", "es-kf-barometer", "es-kf-undelayed", "ckf-barometer", "rpf-barometer"),
+    "car": ("es-kf", "es-kf-constraint", "ckf-constraint"),
+}
 
 EXAMPLES = """\
 examples:
@@ -39,6 +44,8 @@ examples:
       --out runs/heading
   only two filters, more particles
     run_inertial.py --filters es-kf,rpf --particles 10000 --out runs/many
+  a logged drive whose fixes are withheld for 10, 30 and 60 s
+    run_inertial.py --scenario car --out runs/car
 
 exit codes: 0 done, 1 failed, 2 wrong use, 130 or 143 stopped by SIGINT or
 SIGTERM; finished stages are kept.
@@ -55,15 +62,23 @@ def build_parser() -> ArgumentParser:
         default="sins-sar",
         choices=SCENARIOS,
         help="sins-sar: tactical sensors, as in the study; mems: micromachined ones; heading-unknown: heading off by "
-        "60 deg and no heading fix; outliers: 15 %% of the fixes with ten times their noise",
+        "60 deg and no heading fix; outliers: 15 in 100 fixes with ten times their noise; uav, car: real logs, fixes "
+        "withheld",
     )
     group.add_argument(
-        "--filters", type=str | None, metavar="A,B", help=f"out of {','.join(FILTERS)}; what the scenario is about"
+        "--filters",
+        type=str | None,
+        metavar="A,B",
+        help=f"out of {', '.join(FILTERS)}; of a log out of {', '.join(VARIANTS['uav'])} or "
+        f"{', '.join(VARIANTS['car'][1:])}; default what the scenario is about",
     )
+    group.add_argument("--data", type=str | None, metavar="DIR", help="folder of the log; data/ of the repository")
     group.add_argument("--runs", default=8, type=int, metavar="R", help="Monte-Carlo runs, one batch")
     group.add_argument("--seed", default=0, type=int, help="of sensor noise, start errors and particles")
     group.add_argument("--steps", default=1000, type=int, help="fixes, a second apart; at most 1000")
-    group.add_argument("--particles", default=2000, type=int, metavar="N", help="of the particle filters")
+    group.add_argument(
+        "--particles", type=int | None, metavar="N", help="of the particle filters; 2000, on a log 10000"
+    )
     group.add_argument(
         "--conditional-particles", default=1000, type=int, metavar="N", help="of the Rao-Blackwellised one"
     )
@@ -80,22 +95,30 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(options: dict[str, Any]) -> None:
-    names = None
+    scenario, names = options["scenario"], None
     if options["filters"] is not None:
+        known = VARIANTS.get(scenario, FILTERS)
         names = [name.strip() for name in options["filters"].split(",") if name.strip()]
-        unknown = [name for name in names if name not in FILTERS]
+        unknown = [name for name in names if name not in known]
         if unknown or not names:
-            raise UsageError(f"--filters takes {','.join(FILTERS)}; got {','.join(unknown) or 'none'}")
+            raise UsageError(f"--filters takes {','.join(known)} here; got {','.join(unknown) or 'none'}")
+    if options["data"] is not None and scenario not in VARIANTS:
+        raise UsageError(f"--data belongs to a log, the scenario {scenario} is simulated")
     folder = check_folder(options)
 
     import torch
 
-    from torchfilt.missions.inertial import InertialSettings, run_inertial
+    from torchfilt.missions.inertial import InertialSettings, LogSettings, run_inertial, run_log
     from torchfilt.missions.stages import Stages
 
-    own = ("scenario", "runs", "seed", "steps", "particles", "conditional_particles", "window")
+    particles = {} if options["particles"] is None else {"particles": options["particles"]}
+    own = ("scenario", "runs", "seed", "steps", "conditional_particles", "window")
+    settings: InertialSettings | LogSettings
     try:
-        settings = InertialSettings(**{name: options[name] for name in own})
+        if scenario in VARIANTS:
+            settings = LogSettings(scenario, options["data"], seed=options["seed"], **particles)
+        else:
+            settings = InertialSettings(**{name: options[name] for name in own}, **particles)
     except ValueError as error:
         raise UsageError(str(error)) from None
     if options["threads"] is not None:
@@ -103,7 +126,8 @@ def _run(options: dict[str, Any]) -> None:
     if options["force"]:
         Stages(folder / "stages").clear()
     quiet = options["quiet"]
-    run_inertial(
+    run: Any = run_log if isinstance(settings, LogSettings) else run_inertial
+    run(
         settings,
         folder,
         names,

@@ -40,6 +40,8 @@ def test_it_runs_refuses_to_overwrite_and_goes_on(tmp_path):
         (["--filters", "ekf"], "--filters takes es-kf,"),
         (["--steps", "1001"], "steps must be from 1 to 1000"),
         (["--scenario", "sea"], "invalid choice"),
+        (["--scenario", "car", "--filters", "rpf"], "--filters takes es-kf,es-kf-constraint,ckf-constraint here"),
+        (["--data", "data/car_urban_loop"], "--data belongs to a log, the scenario sins-sar is simulated"),
     ],
 )
 def test_wrong_use_is_code_2_in_one_line(tmp_path, arguments, message):
@@ -54,6 +56,8 @@ def test_the_script_and_the_library_know_the_same_names():
         import run_inertial as script
     finally:
         sys.path.pop(0)
-    from torchfilt.missions.inertial import FILTERS, SCENARIOS
+    from torchfilt.missions.inertial import FILTERS, LOGS, SCENARIOS
+    from torchfilt.missions.inertial.log_scene import VARIANTS
 
-    assert script.FILTERS == FILTERS and script.SCENARIOS[: len(SCENARIOS)] == tuple(SCENARIOS)
+    assert script.FILTERS == FILTERS and (*SCENARIOS, *LOGS) == script.SCENARIOS
+    assert {log: tuple(variants) for log, variants in VARIANTS.items()} == script.VARIANTS

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -59,3 +60,19 @@ class Stages:
         for path in self.folder.glob("*.npz"):
             manifest_path(path).unlink(missing_ok=True)
             path.unlink()
+
+
+def versions() -> dict[str, str]:
+    """Of the programs that made the numbers."""
+    import scipy
+    import torch
+
+    import torchfilt
+
+    return {
+        "torchfilt": torchfilt.__version__,
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+    }

@@ -1,7 +1,6 @@
 """The formation study as a run: stages that are kept, numbers by revolution, a table, figures."""
 
 import json
-import platform
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from torchfilt.missions.formation.scene import (
     scene_bound,
     train_gp,
 )
-from torchfilt.missions.stages import Arrays, Stages
+from torchfilt.missions.stages import Arrays, Stages, versions
 from torchfilt.storage import IntegrityError, atomic_write
 
 METRICS, TABLE = "metrics.json", "table.txt"
@@ -305,18 +304,3 @@ def _plain(value: Any) -> float | None:
     """JSON-ready: None where there is no finite number."""
     number = float(value)
     return number if np.isfinite(number) else None
-
-
-def versions() -> dict[str, str]:
-    """Of the programs that made the numbers."""
-    import scipy
-
-    import torchfilt
-
-    return {
-        "torchfilt": torchfilt.__version__,
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "python": platform.python_version(),
-    }

@@ -208,7 +208,7 @@ VARIANTS: dict[Log, dict[str, Variant]] = {
         "ckf-constraint": Variant("ckf", aided=True),
     },
 }
-# The particle filter takes minutes.
+# The particle filter takes as long as all others together.
 DEFAULT: dict[Log, tuple[str, ...]] = {
     "uav": ("es-kf", "es-kf-barometer", "es-kf-undelayed", "ckf-barometer"),
     "car": ("es-kf", "es-kf-constraint", "ckf-constraint"),

@@ -34,7 +34,7 @@ from torchfilt.missions.inertial.log_scene import (
     make_gaps,
     read_log,
 )
-from torchfilt.missions.stages import Arrays, Stages
+from torchfilt.missions.stages import Arrays, Stages, versions
 from torchfilt.models.attitude import inverse, rotate, to_euler
 from torchfilt.particles import Particles
 from torchfilt.spaces import wrap_angle
@@ -418,8 +418,6 @@ def run_log(
     unknown = [name for name in names if name not in own]
     if unknown or not names:
         raise ValueError(f"variants must be out of {', '.join(own)}, got {', '.join(unknown) or 'none'}")
-    from torchfilt.missions.formation.study import versions
-
     folder = Path(out)
     stages = Stages(folder / "stages", say)
     data = read_log(settings)

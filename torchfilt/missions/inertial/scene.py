@@ -241,6 +241,7 @@ def start_state(name: str, tracker: Filter[Any], scene: Scene, settings: Inertia
     offset = (torch.arange(_BANK, dtype=torch.float64) + 0.5) * spacing - math.pi
     turn = torch.nn.functional.pad(offset.unsqueeze(-1), (2, 12))
     # Each member takes what of the heading's spread lies between it and its neighbours; alike over a grid of Gaussians.
+    assert belief.scale_tril is not None
     factor = belief.scale_tril.clone()
     factor[..., 2, 2] = min(0.6 * spacing, spread)
     weights = torch.log_softmax(-0.5 * (offset / spread).square(), 0).expand_as(belief.log_weights)

@@ -22,7 +22,7 @@ from torchfilt.missions.inertial.scene import (
     make_scene,
     start_state,
 )
-from torchfilt.missions.stages import Arrays, Stages
+from torchfilt.missions.stages import Arrays, Stages, versions
 from torchfilt.models.inertial.error_model import ERROR_SPACE
 from torchfilt.particles import Particles
 from torchfilt.storage import atomic_write
@@ -162,8 +162,6 @@ def run_inertial(
     unknown = [name for name in names if name not in FILTERS]
     if unknown or not names:
         raise ValueError(f"filters must be out of {', '.join(FILTERS)}, got {', '.join(unknown) or 'none'}")
-    from torchfilt.missions.formation.study import versions
-
     folder = Path(out)
     stages = Stages(folder / "stages", say)
     say(f"{settings.scenario}: {SCENARIOS[settings.scenario]}; {settings.runs} runs of {settings.steps} s")
