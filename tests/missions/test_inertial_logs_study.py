@@ -394,7 +394,7 @@ def test_what_is_refused(car, uav):
 
 
 def made_up():
-    """Fixes each second for 200 s, NIS of 3, later 6 for 3; errors grow by (3, 4, 1) cm/s in one gap, twice in the other."""
+    """Fixes each second for 200 s, NIS of 3, later 6 for 3; errors grow by (3, 4, 1) cm/s in gap 0, twice that in 1."""
     stamp = np.arange(100.0, 301.0)
     fixes = len(stamp)
     error, covariance = np.full((fixes, 2, 3), np.nan), np.full((fixes, 2, 3, 3), np.nan)
@@ -622,7 +622,7 @@ def test_consistency_on_the_road(driven):
 
 @pytest.mark.slow
 def test_attitude_on_the_road(driven):
-    """Without the constraint the mean is the mounting; roll's is the receiver's own mounting of 2.5 deg."""
+    """Without the constraint the mean is the mounting; roll's, 2.5 deg, is one that the car's course does not show."""
     plain, aided = (driven[name]["attitude"]["rest"] for name in ("es-kf", "es-kf-constraint"))
     assert plain["heading"]["mean_deg"] == pytest.approx(-1.36, abs=0.3)
     assert plain["pitch"]["mean_deg"] == pytest.approx(-0.74, abs=0.15)
@@ -703,7 +703,7 @@ def test_what_joining_the_samples_costs(request, log, driven, flown):
 
 @pytest.mark.slow
 def test_particles_find_the_same_attitude(uav, flown):
-    """10,000 regularised particles from a start within 20 deg; 2000 lose it (and say nothing)."""
+    """10,000 regularised particles from a start within 20 deg; 2000 lost it with each seed that was tried."""
     settings = LogSettings("uav", FOLDERS["uav"])
     found = summarize(run_variant("rpf-barometer", uav, settings), settings)
     assert found["gaps"] == {} and found["nis"] == {}

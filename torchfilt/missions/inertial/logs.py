@@ -116,16 +116,13 @@ def follow(
     from tqdm import tqdm
 
     tracker = make_filter(drive, variant, settings)
-    fixes = len(drive.fix_time_s)
     count = 0 if gaps is None else len(gaps.before)
-    withheld, branch = torch.zeros(fixes, 1 + count, dtype=torch.bool), None
+    record = _Record(drive, count)
+    branch = None
     if gaps is not None and count:
-        withheld[:, 1:] = gaps.withheld(fixes)
+        record.withheld[:, 1:] = gaps.withheld(len(drive.fix_time_s))
         branch = int(gaps.before[0]) + 1  # the first fix that any row misses
     silent = torch.full_like(drive.measurements[0], torch.nan)
-    rows: dict[str, list[Tensor]] = {}
-    errors = drive.position_m.new_full((fixes, count, 3), torch.nan)
-    claims = drive.position_m.new_full((fixes, count, 3, 3), torch.nan)
     state = tracker.init((1,), settings.seed)
     width, likelihood, begin = 1, 0.0, time.process_time()
     lengths, numbers = drive.dt_s.tolist(), drive.fix.tolist()
@@ -136,29 +133,50 @@ def follow(
             state = _branched(state, width)
         y = silent if i < 0 else drive.measurements[i]
         if i >= 0 and width > 1:
-            y = torch.where(withheld[i, :, None] & drive.by_satellite, torch.nan, y)
+            y = torch.where(record.withheld[i, :, None] & drive.by_satellite, torch.nan, y)
         state, info = tracker.step(state, y.expand(width, -1), drive.controls[k], lengths[k])
         likelihood += float(info.log_likelihood[0])
-        if i < 0:
-            continue
-        mean, covariance = _moments(state.belief)
-        step = _of_row(mean[0], covariance[0]) | _by_part(info, drive.measurements[i], drive.fixes.parts)
-        step["rate_rad_s"] = drive.controls[k, 2] / lengths[k] - mean[0, 12]
-        for key, value in step.items():
-            rows.setdefault(key, []).append(value)
-        if width > 1:
-            inside = withheld[i, 1:]
-            errors[i, inside] = mean[1:][inside, 7:10] - drive.position_m[i]
-            claims[i, inside] = covariance[1:][inside, 6:9, 6:9] + _fix_covariance(drive)
-    arrays = {key: torch.stack(values).numpy() for key, values in rows.items()} | {
-        "time_s": drive.fix_time_s.numpy(),
-        "position_m": drive.position_m.numpy(),
-        "attitude_rad": drive.attitude_rad.numpy(),
-        "gap_error_m": errors.numpy(),
-        "gap_covariance_m2": claims.numpy(),
-    }
+        if i >= 0:
+            record.add(i, state.belief, info, drive.controls[k, 2] / lengths[k])
     told = {"log_likelihood": likelihood, "cpu_s": time.process_time() - begin, "steps": len(lengths)}
-    return arrays | {key: np.array(value) for key, value in told.items()}
+    return record.arrays() | {key: np.array(value) for key, value in told.items()}
+
+
+class _Record:
+    """What `follow` keeps, a fix at a time; withheld (f, 1 + G): which fixes a row misses, none as long as unset."""
+
+    def __init__(self, drive: Drive, gaps: int) -> None:
+        fixes = len(drive.fix_time_s)
+        self.drive = drive
+        self.withheld = torch.zeros(fixes, 1 + gaps, dtype=torch.bool)
+        self.rows: dict[str, list[Tensor]] = {}
+        self.errors = drive.position_m.new_full((fixes, gaps, 3), torch.nan)
+        self.claims = drive.position_m.new_full((fixes, gaps, 3, 3), torch.nan)
+        self.fix_covariance = torch.diag(drive.fixes.standard_deviation[drive.fixes.parts["position"]].square())
+
+    def add(self, i: int, belief: Gaussian | Particles, info: StepInfo, rate: Tensor) -> None:
+        """Fix i; rate: the step's mean about the body's up, biased."""
+        mean, covariance = _moments(belief)
+        step = _of_row(mean[0], covariance[0]) | _by_part(info, self.drive.measurements[i], self.drive.fixes.parts)
+        step["rate_rad_s"] = rate - mean[0, 12]
+        for key, value in step.items():
+            self.rows.setdefault(key, []).append(value)
+        if len(mean) > 1:
+            inside = self.withheld[i, 1:]
+            self.errors[i, inside] = mean[1:][inside, 7:10] - self.drive.position_m[i]
+            self.claims[i, inside] = covariance[1:][inside, 6:9, 6:9] + self.fix_covariance
+
+    def arrays(self) -> Arrays:
+        """By name, leading dim f."""
+        fixed = {
+            "time_s": self.drive.fix_time_s,
+            "position_m": self.drive.position_m,
+            "attitude_rad": self.drive.attitude_rad,
+            "gap_error_m": self.errors,
+            "gap_covariance_m2": self.claims,
+        }
+        series = {key: torch.stack(values) for key, values in self.rows.items()}
+        return {key: value.numpy() for key, value in (series | fixed).items()}
 
 
 def _branched(state: FilterState[Any], rows: int) -> FilterState[Any]:
@@ -174,10 +192,6 @@ def _moments(belief: Gaussian | Particles) -> tuple[Tensor, Tensor]:
     """Mean (R, 16) and covariance (R, 15, 15)."""
     mean, covariance = belief.moments() if isinstance(belief, Particles) else (belief.mean, belief.covariance)
     return mean, covariance.expand(*mean.shape[:-1], *covariance.shape[-2:])
-
-
-def _fix_covariance(drive: Drive) -> Tensor:
-    return torch.diag(drive.fixes.standard_deviation[drive.fixes.parts["position"]].square())
 
 
 def _of_row(mean: Tensor, covariance: Tensor) -> dict[str, Tensor]:
