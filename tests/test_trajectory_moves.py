@@ -389,6 +389,51 @@ def test_streamed_resumed_and_loaded_the_bits_are_the_same(name, resampler, shar
 
 
 @pytest.mark.parametrize("name", MOVES)
+def test_what_the_belief_keeps_of_the_past_belongs_together(name):
+    """Each origin leads to the next by its own noise, and each level is the log-density of what it leads to."""
+    model, (ys, us, dts) = swinging(), problem()
+    belief = tf.BootstrapFilter(model, 60, ess_below(0.7), MOVES[name])(ys, us, dts, seed=2).final.belief
+    states = [*(part.origin for part in belief.past[1:]), belief.x]
+    for k, (part, x) in enumerate(zip(belief.past, states, strict=True), 7 - len(belief.past)):
+        u, dt = us[k].unsqueeze(-2), dts[k, :, None, None]
+        assert torch.equal(part.u, u) and torch.equal(part.dt, dt) and same(part.y, ys[k].unsqueeze(-2))
+        law, seen = model.transition(part.origin, u, dt), model.observation(x, u, dt)
+        level = seen.log_prob(part.y, ~part.y.isnan())
+        if name == "transition":
+            assert part.noise is None and part.mean is None and part.factor is None
+            level = level + law.log_prob(x)
+        else:
+            np.testing.assert_allclose(law.sample(part.noise), x, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(part.level, level, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "own"])
+def test_the_fit_is_of_the_weighted_predicted_cloud(own):
+    """Mean and covariance of the mixture of all particles' laws, with weights that differ and noise of each its own."""
+
+    class Motion(torch.nn.Module):
+        def forward(self, x):
+            size = 0.2 + x[..., :1].square() if own else torch.ones(1, dtype=F64)
+            return tf.Gaussian(x.sin(), size.unsqueeze(-1) * tensor([[0.5, 0.0], [0.2, 0.3]]))
+
+    linear = state_space(PLANE)
+    model = tf.StateSpaceModel(linear.initial, Motion(), linear.observation)
+    move = MetropolisHastings(1, 0.5, "predictive", 2)
+    filter = tf.BootstrapFilter(model, 300, tf.resampling.never(), move)
+    ys = replicate(tensor([[0.5], [0.1]]), 3)
+    before, _ = filter.step(filter.init((3,), 1), ys[0])
+    part = filter.step(before, ys[1])[0].belief.past[-1]
+    law, weights = Motion()(before.belief.x), before.belief.weights.numpy()
+    assert weights.max() > 100 * weights.min()
+    mean = np.einsum("bn,bnd->bd", weights, law.mean)
+    apart = law.mean.numpy() - mean[:, None]
+    covariance = np.einsum("bn,bni,bnj->bij", weights, apart, apart)
+    covariance += np.einsum("bn,bnij->bij", weights, law.covariance)
+    np.testing.assert_allclose(part.mean[:, 0], mean, rtol=0, atol=1e-13)
+    np.testing.assert_allclose((part.factor @ part.factor.mT)[:, 0], covariance, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", MOVES)
 def test_rows_do_not_know_of_each_other(name):
     """Other data in row 0; then row 1 alone with its share of the random numbers is the suite's matter."""
     ys, us, dts = problem()
@@ -448,7 +493,7 @@ class Bounded(torch.nn.Module):
 
 @pytest.mark.parametrize("target", ["transition", "predictive"])
 def test_a_measurement_that_no_particle_explains_leaves_the_window(target):
-    """Row 0 sees something impossible at step 2: its moves go on at once as those of its neighbour do."""
+    """Row 0 sees something impossible at step 2: all goes on as if it had seen nothing then."""
     linear = state_space(PLANE)
     model = tf.StateSpaceModel(linear.initial, linear.transition, Bounded())
     ys = torch.zeros(6, 2, 1, dtype=F64)
@@ -458,6 +503,9 @@ def test_a_measurement_that_no_particle_explains_leaves_the_window(target):
     ok, rate = history.diagnostics.ok, history.diagnostics.acceptance_rate
     assert (~ok).sum() == 1 and not ok[2, 0] and torch.isfinite(history.mean).all()
     assert (rate > 0.3).all()
+    unseen = filter(torch.where(ys > 1e5, torch.nan, ys), seed=1)
+    np.testing.assert_allclose(history.mean, unseen.mean, rtol=0, atol=1e-12)
+    assert torch.equal(rate, unseen.diagnostics.acceptance_rate)
 
 
 def test_the_window_starts_at_the_first_predicted_state():
