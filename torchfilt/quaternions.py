@@ -66,10 +66,13 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
     """Vector v turned by unit quaternions: with t = 2 axis x v the result is v + scalar t + axis x t."""
-    once = cross(q.axis, v)
-    twice = cross(q.axis, once)
-    parts = zip(v, once, twice, strict=True)
-    return vector([torch.add(x, torch.addcmul(t, q.scalar, o), alpha=2) for x, o, t in parts])
+    x, y, z = once = cross(q.axis, v)
+    twice, w = cross(q.axis, once), q.scalar
+    return (
+        torch.add(v[0], torch.addcmul(twice[0], w, x), alpha=2),
+        torch.add(v[1], torch.addcmul(twice[1], w, y), alpha=2),
+        torch.add(v[2], torch.addcmul(twice[2], w, z), alpha=2),
+    )
 
 
 def rotate_back(q: Quaternion, v: Vector) -> Vector:
@@ -84,12 +87,16 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 def product(a: Quaternion, b: Quaternion) -> Quaternion:
     """Hamilton product: turn by b first, then by a."""
-    parts = zip(cross(a.axis, b.axis), a.axis, b.axis, strict=True)
-    axis = [torch.addcmul(torch.addcmul(c, a.scalar, y), x, b.scalar) for c, x, y in parts]
-    scalar = a.scalar * b.scalar
-    for x, y in zip(a.axis, b.axis, strict=True):
-        scalar = torch.addcmul(scalar, x, y, value=-1)
-    return Quaternion(vector(axis), scalar)
+    (p, q, r), s = a
+    (x, y, z), w = b
+    i, j, k = cross(a.axis, b.axis)
+    axis = (
+        torch.addcmul(torch.addcmul(i, s, x), p, w),
+        torch.addcmul(torch.addcmul(j, s, y), q, w),
+        torch.addcmul(torch.addcmul(k, s, z), r, w),
+    )
+    scalar = torch.addcmul(torch.addcmul(s * w, p, x, value=-1), q, y, value=-1)
+    return Quaternion(axis, torch.addcmul(scalar, r, z, value=-1))
 
 
 def exponential(v: Vector, share: float = 1.0) -> Quaternion:

@@ -152,10 +152,14 @@ class Angle:
         Where the circular average vanishes (opposite angles of equal weight) the iteration starts from the angle of the
         heaviest weight, the first among equals: a stationary point, though not the only one.
         """
-        return self.centred(points, weights)[0]
+        return self._iterated(points, weights)[0]
 
     def centred(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """The `mean`, and what each point (..., n, d) is off it."""
+        mean, errors = self._iterated(points, weights)
+        return mean, self.local(mean.unsqueeze(-2), points) if errors is None else errors
+
+    def _iterated(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor | None]:
         sine, cosine = weighted_sum(points.sin(), weights), weighted_sum(points.cos(), weights)
         vanishes = torch.hypot(sine, cosine) < _vanishing(weights).unsqueeze(-1)
         # The limit of the iteration does not depend on where it starts, and `atan2` has no derivative at zero.
@@ -215,10 +219,14 @@ class UnitQuaternion:
 
         Source: Pennec, Computing the mean of geometric features, INRIA report 3371 (1998).
         """
-        return self.centred(points, weights)[0]
+        return self._iterated(points, weights)[0]
 
     def centred(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """The `mean`, and the errors (..., n, 3) of all points from it."""
+        mean, errors = self._iterated(points, weights)
+        return mean, self.local(mean.unsqueeze(-2), points) if errors is None else errors
+
+    def _iterated(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor | None]:
         heaviest = _heaviest(points, weights)
         side = torch.copysign(weights.new_ones(()), (points * heaviest.unsqueeze(-2)).sum(-1).detach())
         average = weighted_sum(points, weights * side)
@@ -316,36 +324,39 @@ def _vanishing(weights: Tensor) -> Tensor:
 
 def _intrinsic_mean(
     space: Space, points: Tensor, weights: Tensor, start: Tensor, *, curved: bool = False, iterations: int = 20
-) -> tuple[Tensor, Tensor]:
-    """Mean and errors from it by the fixed-point iteration ``m <- retract(m, sum of w local(m, x))``.
+) -> tuple[Tensor, Tensor | None]:
+    """Mean by the fixed-point iteration ``m <- retract(m, sum of w local(m, x))``, and the errors from it if at hand.
 
     Rows stop one by one, never because of others. In a curved space a round multiplies the error by a factor, at most
-    the mean of ``|w| angle^2 / 8`` (for angles below 2.7 rad). The derivative gains the same factor a round and starts
-    from nothing, so its rounds are counted too.
+    the mean of ``|w| angle^2 / 8`` (for angles below 2.7 rad), which foretells that the next one would change nothing.
+    The derivative gains the same factor a round and starts from nothing, so its rounds are counted too.
     """
-    mean, errors = start, space.local(start.unsqueeze(-2), points)
-    scale = weights.abs()
+    mean, scale = start, weights.abs()
     tolerance = 8 * torch.finfo(points.dtype).eps * scale.sum(-1, keepdim=True)
     differentiated = is_differentiated(points, weights)
     active = torch.ones(mean.shape[:-1], dtype=torch.bool, device=mean.device).unsqueeze(-1)
     for rounds in range(1, iterations + 1):
+        errors = space.local(mean.unsqueeze(-2), points)
         step = weighted_sum(errors, weights)
-        active = active & (step.abs().amax(-1, keepdim=True) > tolerance)
+        size = step.detach().abs().amax(-1, keepdim=True)
+        active = active & (size > tolerance)
         if not differentiated and _all_false(active):
-            break
+            return mean, errors
         new = space.retract(mean, step)
         # A row that has stopped keeps its value, to the bit, and goes on with its derivative.
         mean = (
-            new + (torch.where(active, new, mean) - new).detach() if differentiated else torch.where(active, new, mean)
+            torch.where(active, new, mean)
+            if not differentiated
+            else new + (torch.where(active, new, mean) - new).detach()
         )
         unfinished = active
-        if curved and differentiated:
-            factor = (errors.detach().square().sum(-1) * scale).sum(-1, keepdim=True) / 8
-            unfinished = active | (factor**rounds > tolerance)
-        errors = space.local(mean.unsqueeze(-2), points)
+        if curved:
+            factor = (errors.detach().square().sum(-1) * scale.detach()).sum(-1, keepdim=True) / 8
+            active = active & (factor * size > tolerance)
+            unfinished = active | (factor**rounds > tolerance) if differentiated else active
         if _all_false(unfinished):
             break
-    return mean, errors
+    return mean, None
 
 
 def _all_false(flags: Tensor) -> bool:

@@ -34,6 +34,9 @@ class ParticleFilter(Filter[Particles]):
     ancestors, carried in the new weights (the stop-gradient estimator): the gradient of the evidence is unbiased, that
     of its logarithm consistent in n.
 
+    A transition law may name the error components that its noise reaches by ``noise_in``, a slice or their indices: a
+    `Prior` proposal then draws no numbers for the others.
+
     Args:
         model: the three laws.
         particles: n; the maximum where the resampler says how many are needed (`kld_adaptive`).
@@ -139,7 +142,7 @@ class ParticleFilter(Filter[Particles]):
             normal = source.normal((self.move.steps, states, *full), step, _MOVE, like)
             uniform = source.uniform((self.move.steps, *shape), step, _ACCEPT, like)
         return StepNoise(
-            source.next_normal(full, generator, like) if self.proposal.draws_at_once else None,
+            self._draw_motion(full, source, generator, like) if self.proposal.draws_at_once else None,
             uniforms,
             redraw,
             normal,
@@ -147,6 +150,18 @@ class ParticleFilter(Filter[Particles]):
             kernel,
             source.seed_of(step, _OWN),
         )
+
+    def _draw_motion(
+        self, shape: tuple[int, ...], source: NoiseSource, generator: torch.Generator, like: Tensor
+    ) -> Tensor:
+        """Normals of ``shape`` (*batch, n, e) for the motion, zero where the law's noise does not reach."""
+        reached = getattr(self.model.transition, "noise_in", None)
+        if reached is None or not isinstance(self.proposal, Prior):
+            return source.next_normal(shape, generator, like)
+        noise = like.new_zeros((shape[-1], *shape[:-1])).movedim(0, -1)
+        count = len(range(shape[-1])[reached]) if isinstance(reached, slice) else len(reached)
+        noise[..., reached] = source.next_normal((*shape[:-1], count), generator, like)
+        return noise
 
     def advance(
         self,

@@ -81,14 +81,15 @@ def gravity(latitude_rad: Tensor, height_m: Tensor) -> Tensor:
 
     Source: NGA.STND.0036 (2014), equations 4-1 and 4-3.
     """
-    return gravity_at(latitude_rad.sin().square(), height_m)
+    sine2 = latitude_rad.sin().square()
+    return gravity_at(sine2, height_m, radii_at(sine2)[1])
 
 
-def gravity_at(sine2: Tensor, height_m: Tensor) -> Tensor:
-    """`gravity` where the square of the latitude's sine is known, (...)."""
-    equator, f = WGS84.gravity_equator_m_s2, WGS84.flattening
-    surface = (equator + equator * _SOMIGLIANA * sine2) / (1 - WGS84.eccentricity2 * sine2).sqrt()
-    ratio = height_m / WGS84.semi_major_m
+def gravity_at(sine2: Tensor, height_m: Tensor, transverse_m: Tensor) -> Tensor:
+    """`gravity` where the square of the latitude's sine and the radius across the meridian are known, (...)."""
+    a, f = WGS84.semi_major_m, WGS84.flattening
+    surface = (WGS84.gravity_equator_m_s2 / a) * (1 + _SOMIGLIANA * sine2) * transverse_m
+    ratio = height_m / a
     falls = 2 * (1 + f + WGS84.centrifugal_ratio) - 4 * f * sine2
     return surface * (1 + ratio * (3 * ratio - falls))
 

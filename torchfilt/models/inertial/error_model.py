@@ -223,6 +223,7 @@ class InertialErrorTransition(nn.Module):
 
     angle_random_walk_rad_sqrt_s: Tensor
     velocity_random_walk_m_s_sqrt_s: Tensor
+    noise_in = slice(0, 6)
 
     def __init__(
         self,
@@ -257,8 +258,8 @@ class InertialErrorTransition(nn.Module):
 
     def _deviation(self, x: Tensor, dt: Step) -> Tensor:
         """Standard deviations (15,), or (*lead, 15) for time steps of their own."""
-        white = torch.stack([self.angle_random_walk_rad_sqrt_s, self.velocity_random_walk_m_s_sqrt_s]).to(x.dtype)
-        each = torch.nn.functional.pad(white.repeat_interleave(3), (0, 9))
+        walks = [self.angle_random_walk_rad_sqrt_s] * 3 + [self.velocity_random_walk_m_s_sqrt_s] * 3
+        each = torch.nn.functional.pad(torch.stack(walks).to(x.dtype), (0, 9))
         return each * (dt.sqrt() if isinstance(dt, Tensor) else float(dt or 0) ** 0.5)
 
 
@@ -314,7 +315,7 @@ def _propagate(x: Tensor, u: SinsStep, dt: Tensor | float, origin: LocalMetres) 
     half_velocity = vector([torch.add(v, g, alpha=0.5) for v, g in zip(velocity, gained, strict=True)])
     north, up = _after(position[1], velocity[1], 0.5 * dt), _after(position[2], velocity[2], 0.5 * dt)
     true_velocity = minus(computed, half_velocity)
-    true_latitude, true_height = latitude - north / origin.north_m, height - up
+    true_latitude, true_height = torch.sub(latitude, north, alpha=1 / origin.north_m), height - up
     seen = _earth_terms(computed, latitude, height, origin)
     real = _earth_terms(true_velocity, true_latitude, true_height, origin)
 
@@ -364,7 +365,7 @@ def _earth_terms(velocity: Vector, latitude: Tensor, height: Tensor, origin: Loc
     spin_north, spin_up = WGS84.rate_rad_s * cosine, WGS84.rate_rad_s * sine
     rate = (-north * per_north, spin_north + turn, torch.addcmul(spin_up, turn, sine / cosine))
     coriolis = cross(velocity, (rate[0], rate[1] + spin_north, rate[2] + spin_up))
-    acceleration = (coriolis[0], coriolis[1], coriolis[2] - gravity_at(sine2, height))
+    acceleration = (coriolis[0], coriolis[1], coriolis[2] - gravity_at(sine2, height, transverse))
     return _EarthTerms(rate, acceleration, (origin.east_m * per_east / cosine, origin.north_m * per_north))
 
 
