@@ -19,7 +19,7 @@ from torchfilt.metrics import consistency
 from torchfilt.models import attitude
 from torchfilt.models.inertial.earth import LocalMetres
 from torchfilt.models.inertial.navigation import NAVIGATION_SPACE, NavigationFixes, StrapdownTransition
-from torchfilt.models.inertial.strapdown import join
+from torchfilt.models.inertial.strapdown import compensate, join
 
 # %% [markdown]
 # ## The log
@@ -33,15 +33,17 @@ print(f"{len(log.time_s)} inertial samples at {rate:.0f} Hz, {len(log.gnss.time_
 
 # %% [markdown]
 # ## Steps of the filter
-# A quarter of a second each, from 9.5 s, when the car is about to start. `join` puts the samples of a step together as
-# rotations, not as a sum. Fixes come every half second: every second step has one, the others are NaN, *not measured*.
+# A quarter of a second each, from 9.5 s, when the car is about to start. Within a step the car turns: `compensate`
+# refers each sample to the axes it began in, `join` puts them together as rotations. Fixes come every half second:
+# every second step has one, the others are NaN, *not measured*.
 
 # %%
 start_s, step_s = 9.5, 0.25
 times = start_s + step_s * torch.arange(1521, dtype=torch.float64)
 steps = group_increments(log, times_s=times)
 span = steps.sample_dt_s.unsqueeze(-1)
-controls = torch.cat(join(steps.gyro_rad_s * span, steps.accel_m_s2 * span), -1)
+samples = (steps.gyro_rad_s * span, steps.accel_m_s2 * span)
+controls = torch.cat(join(*compensate(*(part.unsqueeze(-2) for part in samples))), -1)
 
 first = torch.searchsorted(log.gnss.time_s, start_s)
 place = (log.gnss.latitude_rad, log.gnss.longitude_rad, log.gnss.height_m)
