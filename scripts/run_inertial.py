@@ -28,6 +28,7 @@ FILTERS = (
     "mpf-window",
     "mpf-literal",
     "rbpf",
+    "rbpf-shared",
 )
 # Of the logged drives: filters with and without what helps them.
 VARIANTS = {

@@ -53,13 +53,16 @@ def test_many_particles_are_as_good(name):
     assert numbers(name, particles=10_000)["position_m"] < 1.03 * numbers("es-kf")["position_m"]
 
 
-def test_rao_blackwell_comes_close():
-    assert numbers("rbpf")["position_m"] < 1.1 * numbers("es-kf")["position_m"]
+@pytest.mark.parametrize("name", ["rbpf", "rbpf-shared"])
+def test_rao_blackwell_comes_close(name):
+    """In metres; with an attitude that is drawn and 1000 particles, what it claims is far too little."""
+    assert numbers(name)["position_m"] < 1.1 * numbers("es-kf")["position_m"]
 
 
 def test_the_reversible_kernel_is_accepted():
+    """Five measurements at once refuse more than one."""
     assert numbers("mpf")["acceptance"] > 0.9
-    assert numbers("mpf-window")["acceptance"] > 0.9
+    assert numbers("mpf-window")["acceptance"] > 0.75
     assert numbers("mpf-window")["position_m"] < 1.2 * numbers("es-kf")["position_m"]
 
 

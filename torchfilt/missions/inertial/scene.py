@@ -203,16 +203,31 @@ def _filters(scene: Scene, settings: InertialSettings) -> dict[str, Callable[[],
         "mpf-window": lambda: ResampleMoveParticleFilter(heavy, n, window=settings.window),
         "mpf-literal": lambda: ResampleMoveParticleFilter(heavy, n, window=settings.window, target="transition"),
         "rbpf": lambda: RaoBlackwellizedParticleFilter(model, settings.conditional_particles, drawn=attitude),
+        "rbpf-shared": lambda: RaoBlackwellizedParticleFilter(
+            model, settings.conditional_particles, drawn=attitude, shared=True
+        ),
     }
 
 
 FILTERS = (
     "es-kf", "es-kf-gated", "es-kf-open", "ckf", "bank-36", "sir", "rpf-plain", "rpf", "mpf", "mpf-window",
-    "mpf-literal", "rbpf",
+    "mpf-literal", "rbpf", "rbpf-shared",
 )  # fmt: skip
 # What each scenario is about.
 DEFAULT: dict[Scenario, tuple[str, ...]] = {
-    "sins-sar": ("es-kf", "es-kf-open", "ckf", "sir", "rpf-plain", "rpf", "mpf", "mpf-window", "mpf-literal", "rbpf"),
+    "sins-sar": (
+        "es-kf",
+        "es-kf-open",
+        "ckf",
+        "sir",
+        "rpf-plain",
+        "rpf",
+        "mpf",
+        "mpf-window",
+        "mpf-literal",
+        "rbpf",
+        "rbpf-shared",
+    ),
     "mems": ("es-kf", "es-kf-open", "ckf", "rpf", "mpf", "rbpf"),
     "heading-unknown": ("es-kf", "ckf", "bank-36", "sir", "rpf", "mpf"),
     "outliers": ("es-kf", "es-kf-gated", "sir", "rpf", "mpf"),

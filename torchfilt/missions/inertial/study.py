@@ -201,7 +201,7 @@ def _recipe(name: str, settings: InertialSettings) -> dict[str, Any]:
     own = {"version": _VERSION, **settings.to_dict()}
     if name not in _PARTICLES:
         del own["particles"]
-    if name != "rbpf":
+    if not name.startswith("rbpf"):
         del own["conditional_particles"]
     if name not in ("mpf-window", "mpf-literal"):
         del own["window"]
