@@ -125,7 +125,10 @@ def second_moment(deviation: Tensor, weights: Tensor) -> Tensor:
     if by_component.numel() * len(by_component) <= _BLOCK:
         rows = steady_sum(weighted.unsqueeze(1) * by_component, -1)
     else:
-        rows = torch.stack([steady_sum(row * by_component, -1) for row in weighted])
+        # The lower triangle will do; room for a row's rest is made behind it.
+        lower = [steady_sum(row * by_component[: k + 1], -1) for k, row in enumerate(weighted)]
+        behind = (0, 0) * (weighted.dim() - 2)
+        rows = torch.stack([torch.nn.functional.pad(row, (*behind, 0, len(lower) - len(row))) for row in lower])
     lower = rows.movedim((0, 1), (-2, -1)).tril()
     return lower + lower.tril(-1).mT
 
