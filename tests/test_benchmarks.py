@@ -14,15 +14,29 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if not path.name.startswith("_"))
 
 
-@pytest.fixture(scope="module")
-def bench():
-    pytest.importorskip("filterpy")
-    spec = importlib.util.spec_from_file_location("bench_filters", FOLDER / "bench_filters.py")
+def loaded(script):
+    spec = importlib.util.spec_from_file_location(script, FOLDER / f"{script}.py")
     module = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(FOLDER)  # where a script finds the files it shares with others
         spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def bench():
+    pytest.importorskip("filterpy")
+    return loaded("bench_filters")
+
+
+@pytest.fixture(scope="module")
+def inertial():
+    return loaded("bench_inertial")
+
+
+@pytest.fixture(scope="module")
+def scene(inertial):
+    return inertial.make_scene(inertial.InertialSettings(runs=2, steps=16, particles=200))
 
 
 @pytest.mark.slow
@@ -133,3 +147,39 @@ def test_result_is_written_between_the_marks(bench, tmp_path):
     script.write_text("x = 1\n")
     with pytest.raises(ValueError, match="must hold the lines"):
         bench.harness.write_result(str(script), "new")
+
+
+# The inertial problem ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["sir", "rpf"])
+@pytest.mark.parametrize("rows", [None, 2])
+def test_the_bare_inertial_loop_is_the_librarys_filter(inertial, scene, kind, rows):
+    """Given the same random numbers, to rounding; and with others its log-likelihood is another one."""
+    case = inertial.Case(scene, kind, 200, rows)
+    case.check()
+    total, means = case.library()
+    own, own_means = case.by_hand(*inertial.bare.drawn_by_torch(200, case.batch, kind == "rpf", 1))
+    assert own.shape == total.shape and own_means.shape == means.shape
+    assert (own - total).abs().min() > 1e-3
+    same, _ = case.by_hand(*inertial.drawn_alike(200, case.batch, kind == "rpf", 1))
+    assert (same - total).abs().min() > 1e-3
+
+
+@pytest.mark.parametrize("wrong", ["log-likelihoods", "means"])
+def test_a_wrong_inertial_row_is_found(inertial, scene, monkeypatch, wrong):
+    case = inertial.Case(scene, "sir", 200, None)
+    total, means = case.library()
+    off = (total + 1e-8, means) if wrong == "log-likelihoods" else (total, means + 1e-7)
+    monkeypatch.setattr(case, "library", lambda: off)
+    with pytest.raises(AssertionError, match=f"sir, n = 200: {wrong} differ by"):
+        case.check()
+
+
+def test_regress_inertial_step_needs_few_calls(inertial, scene):
+    """What was last measured, without views, so that it can only fall; the bare loop's shows what is to gain."""
+    for kind, most, by_hand in (("sir", 495, 403), ("rpf", 610, 464)):
+        counted = inertial.calls(scene, kind, 500)
+        for name, limit in (("torchfilt", most), (inertial.OWN, by_hand)):
+            total, views = counted[name]
+            assert 0 < total - views <= limit, f"{kind}, {name}"

@@ -168,3 +168,19 @@ def test_bandwidth_needs_particles_and_dimensions():
         optimal_bandwidth(0, 5)
     with pytest.raises(ValueError, match="size must be at least 1 and particles at least 2, got 3 and 1"):
         optimal_bandwidth(3, 1)
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_ancestors_only_save_the_way_to_the_errors(keep):
+    """What is gathered and what is found again agree to the bit."""
+    space = tf.Product(tf.UnitQuaternion("left"), tf.Euclidean(2))
+    middle = space.project(torch.tensor([0.1, -0.2, 0.3, 0.9, 1.0, 2.0], dtype=F64))
+    cloud = tf.Particles(
+        space.retract(middle, 0.1 * normals(2, 300, 5)), torch.log_softmax(normals(2, 300, seed=2), -1), space=space
+    )
+    uniforms = torch.rand(2, 1, generator=torch.Generator().manual_seed(3), dtype=F64)
+    ancestors, copies, noise = systematic(cloud.weights, uniforms), resampled(cloud), normals(2, 300, 5, seed=4)
+    kernel = Regularize(keep_moments=keep)
+    found, gathered = (kernel(cloud, copies, noise, None, known).x for known in (None, ancestors))
+    assert torch.equal(found, gathered)
+    assert torch.equal(kernel(cloud.with_centre(), copies, noise, None, ancestors).x, gathered)

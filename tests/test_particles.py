@@ -208,3 +208,46 @@ def test_weights_held_beside_log_weights_count_for_these_alone() -> None:
     other = torch.log(torch.tensor([0.7, 0.2, 0.1], dtype=torch.float64))
     torch.testing.assert_close(cloud._replace(log_weights=other).weights, other.exp(), rtol=1e-15, atol=0)
     torch.testing.assert_close(cloud._replace(log_weights=other).mean, other.exp(), rtol=1e-15, atol=0)
+
+
+# Mean and errors that are kept ----------------------------------------------------------------------------------------
+
+
+def kept(seed=3):
+    space = Product(UnitQuaternion("left"), Angle(), Euclidean(1))
+    x = space.retract(space.project(normals(2, 1, 6, seed=seed)), 0.3 * normals(2, 40, 5, seed=seed + 1))
+    return Particles(x, torch.log_softmax(normals(2, 40, seed=seed + 2), -1), space=space)
+
+
+def test_a_cloud_that_knows_its_centre_has_the_same_moments():
+    plain = kept()
+    known = plain.with_centre()
+    assert known.centre is not None and known.with_centre() is known
+    assert torch.equal(known.mean, plain.mean)
+    for ours, theirs in zip(known.moments(), plain.moments(), strict=True):
+        assert torch.equal(ours, theirs)
+    assert torch.equal(known.centre.errors, plain.space.local(plain.mean.unsqueeze(-2), plain.x))
+
+
+@pytest.mark.parametrize("changed", ["x", "log_weights", "space"])
+def test_a_centre_counts_only_for_what_it_was_made_of(changed):
+    known = kept().with_centre()
+    other = {
+        "x": known.space.retract(known.x, torch.full((5,), 0.1, dtype=torch.float64)),
+        "log_weights": known.log_weights.flip(-1),
+        "space": Product(UnitQuaternion("right"), Angle(), Euclidean(1)),
+    }
+    after = known._replace(**{changed: other[changed]})
+    plain = Particles(after.x, after.log_weights, space=after.space)
+    for ours, theirs in zip(after.moments(), plain.moments(), strict=True):
+        assert torch.equal(ours, theirs)
+    assert torch.equal(after.mean, plain.mean)
+    assert not torch.equal(after.covariance, known.covariance)
+
+
+def test_a_centre_does_not_depend_on_the_order_in_memory():
+    known = kept()
+    rows = known._replace(x=known.x.contiguous())
+    assert rows.x.stride() != known.x.stride()
+    one, other = known.with_centre().centre, rows.with_centre().centre
+    assert torch.equal(one.mean, other.mean) and torch.equal(one.errors, other.errors)

@@ -10,7 +10,17 @@ from hypothesis import strategies as st
 from oracles import rotations_oracle as oracle
 
 from torchfilt.linalg import is_differentiated
-from torchfilt.spaces import Angle, Euclidean, Product, Space, UnitQuaternion, steady_sum, weighted_sum, wrap_angle
+from torchfilt.spaces import (
+    Angle,
+    Euclidean,
+    Product,
+    Space,
+    UnitQuaternion,
+    centred,
+    steady_sum,
+    weighted_sum,
+    wrap_angle,
+)
 
 DTYPES = [torch.float64, torch.float32]
 SIDES = ["right", "left"]
@@ -423,6 +433,36 @@ def test_derivatives_of_the_mean(space, draw, symmetric):
     tangent = normals(*points.shape, seed=4)
     along = torch.func.jvp(lambda p: mean(p, weights), (points,), (tangent,))[1]
     torch.testing.assert_close(along, torch.einsum("and,nd->a", forward, tangent), rtol=0, atol=1e-12)
+
+
+@spaces
+@pytest.mark.parametrize("gradients", [False, True])
+def test_mean_and_errors_in_one_are_the_two(space, draw, gradients):
+    points, weights = draw(3, 7, seed=0).requires_grad_(gradients), weights_of(3, 7, seed=1)
+    mean, errors = centred(space, points, weights)
+    assert torch.equal(mean, space.mean(points, weights))
+    assert torch.equal(errors, space.local(mean.unsqueeze(-2), points))
+    if gradients:
+        ours = torch.autograd.grad(errors.sum(), points, retain_graph=True)
+        theirs = torch.autograd.grad(space.local(space.mean(points, weights).unsqueeze(-2), points).sum(), points)
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-14)
+
+
+class Shifted(Euclidean):
+    """A space of a user, with no more than a space must have."""
+
+
+def test_errors_on_a_space_that_only_has_a_mean():
+    points, weights = normals(5, 2, seed=0), weights_of(5, seed=1)
+    mean, errors = centred(Shifted(2), points, weights)
+    assert torch.equal(mean, weighted_sum(points, weights)) and torch.equal(errors, points - mean)
+
+
+def test_products_lie_component_by_component():
+    """What follows works on components; a row of eight numbers a particle would cost several times as much."""
+    x, v = torch.cat([normals(4, 2, seed=0), quaternions(4, seed=1), normals(4, 2, seed=2)], -1), normals(4, 7, seed=3)
+    y = POSE.retract(x, v)
+    assert y.stride() == POSE.local(x, y).stride() == POSE.project(x).stride() == (1, 4)
 
 
 @spaces

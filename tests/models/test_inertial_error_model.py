@@ -534,5 +534,14 @@ def test_draws_of_outliers():
     assert together > 0.5 * (0.8 + 0.2 * 81 - expected**2)
 
 
+def test_noise_reaches_what_the_law_says():
+    """Filters draw numbers for these components alone."""
+    law = error_model.InertialErrorTransition(ORIGIN, 1e-5, 1e-4)
+    deviation = law(error_model.no_error(), U, 1.0).scale_tril
+    reached = torch.zeros(15, dtype=torch.bool)
+    reached[law.noise_in] = True
+    assert torch.equal(deviation > 0, reached)
+
+
 def test_layout_of_the_control():
     assert sum(part.shape[-1] for part in split_control(U)) == error_model.CONTROL_SIZE == U.shape[-1]
