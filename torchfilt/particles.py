@@ -126,9 +126,9 @@ def second_moment(deviation: Tensor, weights: Tensor) -> Tensor:
         rows = steady_sum(weighted.unsqueeze(1) * by_component, -1)
     else:
         # The lower triangle will do; room for a row's rest is made behind it.
-        lower = [steady_sum(row * by_component[: k + 1], -1) for k, row in enumerate(weighted)]
+        parts = [steady_sum(row * by_component[: k + 1], -1) for k, row in enumerate(weighted)]
         behind = (0, 0) * (weighted.dim() - 2)
-        rows = torch.stack([torch.nn.functional.pad(row, (*behind, 0, len(lower) - len(row))) for row in lower])
+        rows = torch.stack([torch.nn.functional.pad(part, (*behind, 0, len(parts) - len(part))) for part in parts])
     lower = rows.movedim((0, 1), (-2, -1)).tril()
     return lower + lower.tril(-1).mT
 
