@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchfilt.io.car_loop import FILES, SCORE_FROM_S, read_car_loop
-from torchfilt.io.grace import LogError
+from torchfilt.io.files import LogError
 
 FOLDER = Path(__file__).parents[2] / "data" / "car_urban_loop"
 IMU, GNSS, POSITION, ATTITUDE = FILES

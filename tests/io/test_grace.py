@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import relative_motion_oracle as oracle
 
-from torchfilt.io import grace
-from torchfilt.io.grace import FILES, LogError, read_grace, read_orbit, read_range
+from torchfilt.io import files
+from torchfilt.io.files import LogError
+from torchfilt.io.grace import FILES, read_grace, read_orbit, read_range
 from torchfilt.models.relative_motion import (
     J2_EARTH,
     Field,
@@ -213,10 +214,10 @@ def test_file_rules(tmp_path, monkeypatch):
         read_orbit(cut)
     with pytest.raises(FileNotFoundError):
         read_orbit(tmp_path / "absent.csv.gz")
-    monkeypatch.setattr(grace, "MAX_TEXT_BYTES", 100)
+    monkeypatch.setattr(files, "MAX_BYTES", 100)
     with pytest.raises(LogError, match="when unpacked"):
         read_orbit(whole)
-    monkeypatch.setattr(grace, "MAX_PACKED_BYTES", 100)
+    monkeypatch.setattr(files, "MAX_PACKED_BYTES", 100)
     with pytest.raises(LogError, match="more than the limit of 100"):
         read_orbit(whole)
 

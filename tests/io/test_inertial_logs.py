@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfilt.io.grace import LogError
+from torchfilt.io.files import LogError
 from torchfilt.io.inertial import (
     GnssFixes,
     InertialLog,

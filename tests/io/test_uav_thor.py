@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
 from scipy.spatial.transform import Rotation
 
-from torchfilt.io import uav_thor
-from torchfilt.io.grace import LogError
+from torchfilt.io import files, uav_thor
+from torchfilt.io.files import LogError
 from torchfilt.io.uav_thor import AIRBORNE_S, FILE, read_uav_thor
 
 FOLDER = Path(__file__).parents[2] / "data" / "uav_thor75"
@@ -305,10 +305,10 @@ def test_file_rules(tmp_path, monkeypatch):
     with pytest.raises(LogError, match="class 6 with 3 entries, expected one structure"):
         read_uav_thor(tmp_path)
     save(tmp_path, {"flight_data": flight()})
-    monkeypatch.setattr(uav_thor, "MAX_BYTES", 10_000)
+    monkeypatch.setattr(files, "MAX_BYTES", 10_000)
     with pytest.raises(LogError, match="more than the limit of 10000 bytes when unpacked"):
         read_uav_thor(tmp_path)
-    monkeypatch.setattr(uav_thor, "MAX_PACKED_BYTES", 1000)
+    monkeypatch.setattr(files, "MAX_PACKED_BYTES", 1000)
     with pytest.raises(LogError, match="bytes, more than the limit of 1000"):
         read_uav_thor(tmp_path)
 

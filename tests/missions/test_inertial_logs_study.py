@@ -16,7 +16,7 @@ from scipy import stats
 from scipy.io import loadmat, savemat
 from scipy.spatial.transform import Rotation
 
-from torchfilt.io.grace import LogError
+from torchfilt.io.files import LogError
 from torchfilt.io.inertial import Reference
 from torchfilt.io.uav_thor import FILE
 from torchfilt.missions.inertial import log_scene

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilt.io.grace import LogError, _digests, _load
+from torchfilt.io.files import LogError, read_digests, read_packed_text
 from torchfilt.io.inertial import (
     Gaps,
     GnssFixes,
@@ -68,7 +68,7 @@ def read_car_loop(
         LogError: a file is damaged, cut short, foreign or implausible, or a digest differs from the manifest's.
         FileNotFoundError: a file is missing.
     """
-    folder, digests = Path(folder), _digests(manifest)
+    folder, digests = Path(folder), read_digests(manifest)
     columns = (_IMU, _GNSS, _POSITION, _ATTITUDE)
     imu, gnss, position, attitude = (
         _read_table(folder / name, header, digests) for name, header in zip(FILES, columns, strict=True)
@@ -138,7 +138,7 @@ def _wrapped(angle: Tensor) -> Tensor:
 
 
 def _read_table(path: Path, header: str, digests: Mapping[str, str] | None) -> _Table:
-    text = _load(path, digests)
+    text = read_packed_text(path, digests)
     if not text.endswith("\n"):
         raise LogError(f"{path.name}: row {text.count(chr(10))}: no line end; the file is cut short")
     first, *lines = text.replace("\r\n", "\n").split("\n")[:-1]

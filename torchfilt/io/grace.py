@@ -6,11 +6,7 @@ default, inertial axes.
 """
 
 import datetime
-import gzip
-import hashlib
-import json
 import math
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -18,15 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchfilt.io.files import LogError, read_digests, read_packed_text
+
 EARTH_RATE_RAD_S = 7.2921158553e-5
 FILES = ("grca_truth.csv.gz", "grcb_truth.csv.gz", "grc_kb_rng.csv.gz")
-# A day at 10 s is 0.35 MB packed and 0.8 MB unpacked.
-MAX_PACKED_BYTES = 16 * 2**20
-MAX_TEXT_BYTES = 64 * 2**20
-
-
-class LogError(ValueError):
-    """A log file breaks a rule; the message names file, row and rule."""
 
 
 class Orbit(NamedTuple):
@@ -68,7 +59,7 @@ def read_grace(
         FileNotFoundError: a file is missing.
     """
     folder = Path(folder)
-    digests = _digests(manifest)
+    digests = read_digests(manifest)
     first, second = (read_orbit(folder / name, digests, velocity_tolerance_m_s) for name in FILES[:2])
     if not torch.equal(first.time_s, second.time_s):
         raise LogError(f"{FILES[1]}: epochs differ from those of {FILES[0]}")
@@ -144,44 +135,9 @@ def _turn_z(vectors: Tensor, angle: Tensor) -> Tensor:
     return torch.stack([c * x - s * y, s * x + c * y, z], -1)
 
 
-def _digests(manifest: Mapping[str, str] | str | Path | None) -> Mapping[str, str] | None:
-    if manifest is None or isinstance(manifest, Mapping):
-        return manifest
-    try:
-        content = json.loads(Path(manifest).read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise LogError(f"{Path(manifest).name}: not a JSON manifest: {error}") from error
-    if not isinstance(content, dict) or not all(isinstance(value, str) for value in content.values()):
-        raise LogError(f"{Path(manifest).name}: a manifest maps file names to SHA-256 digests")
-    return content
-
-
-def _load(path: Path, digests: Mapping[str, str] | None) -> str:
-    """Text of a packed file, size and digest checked before it is unpacked."""
-    size = path.stat().st_size
-    if size > MAX_PACKED_BYTES:
-        raise LogError(f"{path.name}: {size} bytes, more than the limit of {MAX_PACKED_BYTES}")
-    packed = path.read_bytes()
-    if digests is not None:
-        found = hashlib.sha256(packed).hexdigest()
-        if digests.get(path.name) != found:
-            raise LogError(f"{path.name}: SHA-256 is {found}, the manifest says {digests.get(path.name, 'nothing')}")
-    try:
-        with gzip.open(path, "rb") as stream:
-            text = stream.read(MAX_TEXT_BYTES + 1)
-    except (EOFError, OSError, zlib.error) as error:
-        raise LogError(f"{path.name}: not a whole gzip file: {error}") from error
-    if len(text) > MAX_TEXT_BYTES:
-        raise LogError(f"{path.name}: more than the limit of {MAX_TEXT_BYTES} bytes when unpacked")
-    try:
-        return text.decode("ascii")
-    except UnicodeDecodeError as error:
-        raise LogError(f"{path.name}: not plain text at byte {error.start}") from error
-
-
 def _read_rows(path: Path, columns: int, digests: Mapping[str, str] | None) -> tuple[Tensor, Tensor]:
     """Times (t,) and numbers (t, columns); every rule that one row can break."""
-    text = _load(path, digests)
+    text = read_packed_text(path, digests)
     if not text.endswith("\n"):
         raise LogError(f"{path.name}: row {text.count(chr(10)) + 1}: no line end; the file is cut short")
     lines = text.split("\n")[:-1]

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfilt.io.grace import LogError
+from torchfilt.io.files import LogError
 from torchfilt.models.inertial.imu import check_imu
 
 _EARTH_RADIUS_M = 6.371e6

@@ -5,7 +5,6 @@ arrays of a hostile file until the process dies. Units (degrees, gauss), axes (f
 the magnetometer's offsets, held fixes and the on-board filter's biases end here.
 """
 
-import hashlib
 import io
 import math
 import struct
@@ -18,7 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilt.io.grace import LogError, _digests
+from torchfilt.io import files
+from torchfilt.io.files import LogError, read_digests, read_stored
 from torchfilt.io.inertial import Gaps, GnssFixes, InertialLog, Reference, check_finite, check_fixes, check_samples
 
 FILE = "thor_flight75_WaypointTracker_150squareWaypointNew_2012_10_10.mat"
@@ -26,8 +26,6 @@ FILE = "thor_flight75_WaypointTracker_150squareWaypointNew_2012_10_10.mat"
 AIRBORNE_S = (211.7, 577.0)
 # Before that the logger had not yet set the barometer's zero.
 _BAROMETER_FROM_S = 4.03
-MAX_PACKED_BYTES = 16 * 2**20
-MAX_BYTES = 64 * 2**20
 _FIELDS = (
     *("time", "p", "q", "r", "p_bias", "q_bias", "r_bias", "ax", "ay", "az", "ax_bias", "ay_bias", "az_bias"),
     *("imuStatus", "hx", "hy", "hz", "h", "lat", "lon", "alt", "vn", "ve", "vd", "GPS_TOW", "satVisible"),
@@ -64,7 +62,7 @@ def read_uav_thor(
         FileNotFoundError: the file is missing.
     """
     path = Path(folder) / FILE
-    data = _read_fields(path, _digests(manifest))
+    data = _read_fields(path, read_digests(manifest))
     for name in _FIELDS:
         check_finite(path.name, name, data[name])
 
@@ -132,14 +130,7 @@ def _read_fields(path: Path, digests: Mapping[str, str] | None) -> dict[str, Ten
     """The needed fields of `flight_data`, each (t,) float64."""
     from scipy.io import loadmat
 
-    size = path.stat().st_size
-    if size > MAX_PACKED_BYTES:
-        raise LogError(f"{path.name}: {size} bytes, more than the limit of {MAX_PACKED_BYTES}")
-    stored = path.read_bytes()
-    if digests is not None:
-        found = hashlib.sha256(stored).hexdigest()
-        if digests.get(path.name) != found:
-            raise LogError(f"{path.name}: SHA-256 is {found}, the manifest says {digests.get(path.name, 'nothing')}")
+    stored = read_stored(path, digests)
     try:
         # SciPy's stubs know no streams.
         safe: Any = io.BytesIO(_checked_matlab(stored, "flight_data"))
@@ -191,14 +182,14 @@ def _checked_matlab(stored: bytes, name: str) -> bytes:
     """A MATLAB file of the one variable, which is a flat structure of real arrays that are as large as they say."""
     if len(stored) < 128 or stored[124:128] != b"\x00\x01IM":
         raise ValueError("no head of a little-endian MATLAB 5 file")
-    room, found = MAX_BYTES, []
+    room, found = files.MAX_BYTES, []
     for element in _elements(memoryview(stored)[128:]):
         whole = element.whole
         if element.kind == _PACKED:
             unpacker = zlib.decompressobj()
             unpacked = unpacker.decompress(element.content, room)
             if not unpacker.eof:
-                raise ValueError(f"cut short, or more than the limit of {MAX_BYTES} bytes when unpacked")
+                raise ValueError(f"cut short, or more than the limit of {files.MAX_BYTES} bytes when unpacked")
             room -= len(unpacked)
             whole = memoryview(unpacked)
         for variable in _elements(whole):

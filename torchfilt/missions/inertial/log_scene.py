@@ -260,7 +260,7 @@ def read_log(settings: LogSettings) -> InertialLog:
     """The settings' log.
 
     Raises:
-        torchfilt.io.grace.LogError: its reader refuses a file, which is named with the row.
+        torchfilt.io.files.LogError: its reader refuses a file, which is named with the row.
         FileNotFoundError: a file is missing.
     """
     return read_car_loop(settings.folder) if settings.log == "car" else read_uav_thor(settings.folder)

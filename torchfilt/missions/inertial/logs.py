@@ -424,7 +424,7 @@ def run_log(
         versions.
 
     Raises:
-        ValueError: unknown variant, no room for the gaps. torchfilt.io.grace.LogError: a file of the log is damaged or
+        ValueError: unknown variant, no room for the gaps. torchfilt.io.files.LogError: a file of the log is damaged or
             foreign; it is named with the row.
     """
     log, own = settings.log, VARIANTS[settings.log]
