@@ -24,19 +24,23 @@ class Series:
 
     Args:
         steps: how many there will be at most.
+        at_once: copy small values at once as well. Beside large tensors that come and go each small one that stays
+            keeps a hole of their size open in the heap.
         axis: of the particles, where there are some; steps with fewer than others are filled up.
         filling: what with; None for copies of the last one.
     """
 
-    def __init__(self, steps: int, axis: int | None = None, filling: float | None = None) -> None:
-        self.steps, self.axis, self.filling = steps, axis, filling
+    def __init__(
+        self, steps: int, axis: int | None = None, filling: float | None = None, at_once: bool = False
+    ) -> None:
+        self.steps, self.axis, self.filling, self.at_once = steps, axis, filling, at_once
         self.values: list[Tensor] = []
         self.block: Tensor | None = None
         self.count = 0
 
     def add(self, value: Tensor) -> None:
         """The next step's value."""
-        if self.count == 0 and value.numel() >= _LARGE and not value.requires_grad:
+        if self.count == 0 and (self.at_once or value.numel() >= _LARGE) and not value.requires_grad:
             self.block = _block_like(value, self.steps)
         self.count += 1
         if self.block is None:
@@ -98,9 +102,12 @@ class Recorder:
             raise ValueError(f"record must be 'mean', 'moments' or 'beliefs', got {record!r}")
         self.record, self.evidence, self.steps = record, evidence, steps
         self.series: dict[str, Series] = {}
+        self.at_once = False
 
     def add(self, belief: Gaussian | Particles, info: StepInfo) -> None:
         """Take in one step."""
+        if not self.series and isinstance(belief, Particles):
+            self.at_once = belief.x.numel() >= _LARGE
         if isinstance(belief, Gaussian):
             self._put("mean", belief.mean)
             if self.record != "mean":
@@ -132,7 +139,7 @@ class Recorder:
     def _put(self, name: str, value: Tensor, axis: int | None = None, filling: float | None = None) -> None:
         series = self.series.get(name)
         if series is None:
-            series = self.series[name] = Series(self.steps, axis, filling)
+            series = self.series[name] = Series(self.steps, axis, filling, self.at_once)
         series.add(value)
 
     def finish(self, final: FilterState[Any]) -> History:

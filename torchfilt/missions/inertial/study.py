@@ -25,6 +25,7 @@ from torchfilt.missions.inertial.scene import (
 from torchfilt.missions.stages import Arrays, Stages, versions
 from torchfilt.models.inertial.error_model import ERROR_SPACE
 from torchfilt.particles import Particles
+from torchfilt.recording import Series
 from torchfilt.storage import atomic_write
 
 METRICS, TABLE = "metrics.json", "table.txt"
@@ -60,9 +61,10 @@ def run_filter(name: str, scene: Scene, settings: InertialSettings, progress: bo
     tracker = make_filter(name, scene, settings)
     runs = scene.truth.shape[1]
     state = start_state(name, tracker, scene, settings)
-    rows: dict[str, list[Tensor]] = {}
+    steps = len(scene.fixes)
+    rows: dict[str, Series] = {}
     roots = None
-    for k in tqdm(range(len(scene.fixes)), unit="step", disable=None if progress else True):
+    for k in tqdm(range(steps), unit="step", disable=None if progress else True):
         begin = time.process_time()
         with torch.no_grad():
             state, info = tracker.step(state, scene.fixes[k], scene.controls[k], 1.0, throw=False)
@@ -85,8 +87,8 @@ def run_filter(name: str, scene: Scene, settings: InertialSettings, progress: bo
             "cpu_s": torch.tensor(seconds),
         }
         for key, value in step.items():
-            rows.setdefault(key, []).append(value)
-    return {key: torch.stack(values).numpy() for key, values in rows.items()}
+            rows.setdefault(key, Series(steps, at_once=True)).add(value)
+    return {key: series.stacked().numpy() for key, series in rows.items()}
 
 
 def different(indices: Tensor) -> Tensor:
