@@ -126,7 +126,7 @@ def _first(values: Tensor, bad: Tensor) -> str:
 def apply_factor(factor: Tensor, vectors: Tensor, *, diagonal: bool = False) -> Tensor:
     """``factor @ v`` for each vector, one matrix product when the factor is shared.
 
-    The library behind float32 products may round differently with another number of threads; in float64 it does not.
+    The library behind the product may round differently with another number of threads; in float64 it seldom does.
 
     Args:
         factor: (e, e), (*batch, 1, e, e) or one per vector (*batch, n, e, e); with ``diagonal``, (..., e).

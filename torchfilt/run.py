@@ -147,8 +147,8 @@ class Filter(nn.Module, Generic[B]):
             dt: time steps, s: a number (a tensor too), (t,) or (t, *batch).
             predict_first: False where the first measurement belongs to the time of the prior itself.
             state: where to go on from (``history.final``), with its own seed; default the prior.
-            seed: of the random numbers where no state brings its own; the same seed gives the same bits (in float64 for
-                any number of threads).
+            seed: of the random numbers where no state brings its own; the same seed gives the same bits for the
+                same number of threads.
             record: "mean", "moments" (mean and covariance) or "beliefs" (everything that is carried).
             throw: raise on failed rows; False leaves it to ``history.diagnostics.ok``.
             progress: show a bar on a terminal.
