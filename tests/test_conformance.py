@@ -697,3 +697,26 @@ def test_checks_say_how_to_be_called():
         check_law(Leaky("none"), X2[0])
     with pytest.raises(AssertionError, match="t >= 4"):
         check_filter(tf.KalmanFilter(LINEAR), torch.zeros(2, 2, dtype=DOUBLE))
+
+
+EYE = torch.eye(2, dtype=DOUBLE)
+
+
+@pytest.mark.parametrize(
+    ("offer", "message"),
+    [
+        ({"noise_in": slice(0, 1)}, "noise_in must name every component that noise reaches"),
+        ({"first_order": lambda x, u=None, dt=None: (tf.Gaussian(x + 1e-6, EYE), EYE)}, "the law of first_order"),
+    ],
+)
+def test_broken_offers_of_a_law_are_caught(offer, message):
+    law = tf.AdditiveGaussian(lambda x: 1.0 * x, EYE)
+    x = normal(3, 2)
+    check_law(law, x)
+    for name, value in offer.items():
+        setattr(law, name, value)
+    with pytest.raises(AssertionError, match=message):
+        check_law(law, x)
+    law.noise_in = [1, 0]
+    if "noise_in" in offer:
+        check_law(law, x)

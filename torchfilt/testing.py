@@ -144,7 +144,15 @@ def _check_law_rows(
 def _check_short_cuts(
     name: str, law: Any, x: Tensor, u: Tensor | None, dt: Step, whole: Gaussian, tolerance: float
 ) -> None:
-    """`linear_form` and `pooled`, where a law has them, agree with the law itself."""
+    """What a law offers beside the call agrees with the law itself."""
+    if hasattr(law, "first_order"):
+        at, _ = law.first_order(x, u, dt)
+        _close_laws(f"{name}: the law of first_order and the law itself", as_gaussian(at), whole, tolerance)
+    if hasattr(law, "noise_in"):
+        reached = torch.zeros(whole.tangent_size, dtype=torch.bool)
+        reached[law.noise_in if isinstance(law.noise_in, slice) else list(law.noise_in)] = True
+        beyond = whole.factor()[..., ~reached, :]
+        _require(not bool(beyond.any()), f"{name}: noise_in must name every component that noise reaches")
     if hasattr(law, "linear_form"):
         matrix, offset, factor = law.linear_form(u, dt)
         mean = (matrix @ x.unsqueeze(-1)).squeeze(-1)
