@@ -3,7 +3,7 @@
 import signal
 import sys
 from argparse import RawDescriptionHelpFormatter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -69,6 +69,32 @@ def check_folder(options: dict[str, Any]) -> Path:
     if options["threads"] is not None and options["threads"] < 1:
         raise UsageError(f"--threads must be at least 1, got {options['threads']}")
     return folder
+
+
+def chosen(text: str, known: Sequence[str]) -> list[str]:
+    """Names of ``--filters``, separated by commas.
+
+    Raises:
+        UsageError: none, or one that is not known.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        raise UsageError(f"--filters takes {','.join(known)}; got {','.join(unknown) or 'none'}")
+    return names
+
+
+def prepare(options: dict[str, Any], folder: Path) -> Callable[[str], None]:
+    """Set the threads, clear what ``--force`` overwrites; returns what a study tells its lines to."""
+    import torch
+
+    from torchfilt.missions.stages import Stages
+
+    if options["threads"] is not None:
+        torch.set_num_threads(options["threads"])
+    if options["force"]:
+        Stages(folder / "stages").clear()
+    return (lambda line: None) if options["quiet"] else (lambda line: print(line, flush=True))
 
 
 class Signals:

@@ -11,7 +11,7 @@ table.txt, figures and the stages from which an interrupted run goes on.
 import sys
 from typing import Any
 
-from _command import UsageError, add_output_options, check_folder, new_parser, run_command
+from _command import UsageError, add_output_options, check_folder, chosen, new_parser, prepare, run_command
 from jsonargparse import ArgumentParser
 
 FILTERS = (
@@ -91,33 +91,23 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(options: dict[str, Any]) -> None:
-    names = [name.strip() for name in options["filters"].split(",") if name.strip()]
-    unknown = [name for name in names if name not in FILTERS]
-    if unknown or not names:
-        raise UsageError(f"--filters takes {','.join(FILTERS)}; got {','.join(unknown) or 'none'}")
+    names = chosen(options["filters"], FILTERS)
     folder = check_folder(options)
 
-    import torch
-
     from torchfilt.missions.formation import StudySettings, run_formation
-    from torchfilt.missions.stages import Stages
 
     own = ("runs", "seed", "case", "particles", "bootstrap_particles", "samples", "training_seed", "steps")
     try:
         settings = StudySettings(**{name: options[name] for name in (*own, "gp_psd_m2_s3", "cw_psd_m2_s3")})
     except ValueError as error:
         raise UsageError(str(error)) from None
-    if options["threads"] is not None:
-        torch.set_num_threads(options["threads"])
-    if options["force"]:
-        Stages(folder / "stages").clear()
-    quiet = options["quiet"]
+    say = prepare(options, folder)
     run_formation(
         settings,
         folder,
         names,
-        say=(lambda line: None) if quiet else (lambda line: print(line, flush=True)),
-        progress=not quiet,
+        say=say,
+        progress=not options["quiet"],
         figures=options["figures"],
     )
 

@@ -11,7 +11,7 @@ receives settings, metrics, a table, figures and the finished parts.
 import sys
 from typing import Any
 
-from _command import UsageError, add_output_options, check_folder, new_parser, run_command
+from _command import UsageError, add_output_options, check_folder, new_parser, prepare, run_command
 from jsonargparse import ArgumentParser
 
 EXAMPLES = """\
@@ -85,31 +85,18 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: dict[str, Any]) -> None:
     folder = check_folder(options)
     options.pop("config", None)
-    _, force, _, figures, threads, quiet, _ = (
-        options.pop(name) for name in ("out", "force", "resume", "figures", "threads", "quiet", "debug")
-    )
-
-    import torch
+    output = {name: options.pop(name) for name in ("out", "force", "resume", "figures", "threads", "quiet", "debug")}
 
     from torchfilt.missions.grace.campaign import run
     from torchfilt.missions.grace.settings import GraceSettings
-    from torchfilt.missions.stages import Stages
 
     starts = options.pop("outage_starts_h")
     try:
         settings = GraceSettings(**options, outage_starts_h=None if starts is None else tuple(starts))
     except ValueError as error:
         raise UsageError(str(error)) from None
-    if threads is not None:
-        torch.set_num_threads(threads)
-    if force:
-        Stages(folder / "stages").clear()
-
-    def say(line: str) -> None:
-        if not quiet:
-            print(line, flush=True)
-
-    run(settings, out=folder, figures=figures, say=say, progress=not quiet)
+    say = prepare(output, folder)
+    run(settings, out=folder, figures=output["figures"], say=say, progress=not output["quiet"])
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ interrupted run goes on.
 import sys
 from typing import Any
 
-from _command import UsageError, add_output_options, check_folder, new_parser, run_command
+from _command import UsageError, add_output_options, check_folder, chosen, new_parser, prepare, run_command
 from jsonargparse import ArgumentParser
 
 SCENARIOS = ("sins-sar", "mems", "heading-unknown", "outliers", "uav", "car")
@@ -35,6 +35,9 @@ VARIANTS = {
     "uav": ("es-kf", "es-kf-barometer", "es-kf-undelayed", "ckf-barometer", "rpf-barometer"),
     "car": ("es-kf", "es-kf-constraint", "ckf-constraint"),
 }
+
+# A log has its own length and one run.
+FLIGHT_OPTIONS = ("runs", "steps", "conditional_particles", "window")
 
 EXAMPLES = """\
 examples:
@@ -98,22 +101,20 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: dict[str, Any]) -> None:
     scenario, names = options["scenario"], None
     if options["filters"] is not None:
-        known = VARIANTS.get(scenario, FILTERS)
-        names = [name.strip() for name in options["filters"].split(",") if name.strip()]
-        unknown = [name for name in names if name not in known]
-        if unknown or not names:
-            raise UsageError(f"--filters takes {','.join(known)} here; got {','.join(unknown) or 'none'}")
+        names = chosen(options["filters"], VARIANTS.get(scenario, FILTERS))
     if options["data"] is not None and scenario not in VARIANTS:
         raise UsageError(f"--data belongs to a log, the scenario {scenario} is simulated")
+    usual = build_parser().get_defaults()
+    given = [name for name in FLIGHT_OPTIONS if options[name] != usual[name]]
+    if given and scenario in VARIANTS:
+        option = given[0].replace("_", "-")
+        raise UsageError(f"--{option} belongs to a simulated flight, the scenario {scenario} is a log")
     folder = check_folder(options)
 
-    import torch
-
     from torchfilt.missions.inertial import InertialSettings, LogSettings, run_inertial, run_log
-    from torchfilt.missions.stages import Stages
 
     particles = {} if options["particles"] is None else {"particles": options["particles"]}
-    own = ("scenario", "runs", "seed", "steps", "conditional_particles", "window")
+    own = ("scenario", "seed", *FLIGHT_OPTIONS)
     settings: InertialSettings | LogSettings
     try:
         if scenario in VARIANTS:
@@ -122,18 +123,14 @@ def _run(options: dict[str, Any]) -> None:
             settings = InertialSettings(**{name: options[name] for name in own}, **particles)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    if options["threads"] is not None:
-        torch.set_num_threads(options["threads"])
-    if options["force"]:
-        Stages(folder / "stages").clear()
-    quiet = options["quiet"]
+    say = prepare(options, folder)
     run: Any = run_log if isinstance(settings, LogSettings) else run_inertial
     run(
         settings,
         folder,
         names,
-        say=(lambda line: None) if quiet else (lambda line: print(line, flush=True)),
-        progress=not quiet,
+        say=say,
+        progress=not options["quiet"],
         figures=options["figures"],
     )
 

@@ -40,7 +40,8 @@ def test_it_runs_refuses_to_overwrite_and_goes_on(tmp_path):
         (["--filters", "ekf"], "--filters takes es-kf,"),
         (["--steps", "1001"], "steps must be from 1 to 1000"),
         (["--scenario", "sea"], "invalid choice"),
-        (["--scenario", "car", "--filters", "rpf"], "--filters takes es-kf,es-kf-constraint,ckf-constraint here"),
+        (["--scenario", "car", "--filters", "rpf"], "--filters takes es-kf,es-kf-constraint,ckf-constraint; got rpf"),
+        (["--scenario", "uav", "--steps", "50"], "--steps belongs to a simulated flight, the scenario uav is a log"),
         (["--data", "data/car_urban_loop"], "--data belongs to a log, the scenario sins-sar is simulated"),
     ],
 )

@@ -3,16 +3,17 @@
 import hashlib
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchfilt.storage import IntegrityError, manifest_path, read_arrays, write_arrays
+from torchfilt.storage import IntegrityError, atomic_write, manifest_path, read_arrays, write_arrays
 
 Arrays = dict[str, np.ndarray]
 FILE_KIND = "torchfilt stage"
+METRICS, TABLE = "metrics.json", "table.txt"
 
 
 class Stages:
@@ -33,6 +34,11 @@ class Stages:
             return None
         digest = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:12]
         return self.folder / f"{name}-{digest}.{suffix}"
+
+    def has(self, name: str, recipe: dict[str, Any]) -> bool:
+        """Whether a file of this recipe exists."""
+        path = self.path(name, recipe)
+        return path is not None and path.is_file()
 
     def get(self, name: str, recipe: dict[str, Any], compute: Callable[[], Arrays]) -> Arrays:
         """Arrays of a stage: read where a whole file of this recipe exists, else computed and kept.
@@ -60,6 +66,19 @@ class Stages:
         for path in self.folder.glob("*.npz"):
             manifest_path(path).unlink(missing_ok=True)
             path.unlink()
+
+
+def check_names(names: Sequence[str], known: Collection[str], what: str) -> None:
+    """Raise a ValueError unless there are names and all of them are known; ``what`` they name, in the plural."""
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        raise ValueError(f"{what} must be out of {', '.join(known)}, got {', '.join(unknown) or 'none'}")
+
+
+def write_outcome(folder: Path, lines: Sequence[str], numbers: dict[str, Any]) -> None:
+    """Write a study's table and its numbers, atomically; the numbers last: a folder with them is a finished run."""
+    atomic_write(folder / TABLE, ("\n".join(lines).strip("\n") + "\n").encode())
+    atomic_write(folder / METRICS, (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode())
 
 
 def versions() -> dict[str, str]:

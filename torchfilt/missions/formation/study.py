@@ -1,6 +1,5 @@
 """The formation study as a run: stages that are kept, numbers by revolution, a table, figures."""
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,10 +21,9 @@ from torchfilt.missions.formation.scene import (
     scene_bound,
     train_gp,
 )
-from torchfilt.missions.stages import Arrays, Stages, versions
-from torchfilt.storage import IntegrityError, atomic_write
+from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.storage import IntegrityError
 
-METRICS, TABLE = "metrics.json", "table.txt"
 # Results of another version of the arithmetic are not reused: raise this with it.
 _VERSION = 1
 # A run is lost where its position error over a revolution is above this, m: one radar sample gives 0.25 m.
@@ -164,9 +162,7 @@ def run_formation(
     Raises:
         ValueError: unknown filter.
     """
-    unknown = [name for name in filters if name not in FILTERS]
-    if unknown or not filters:
-        raise ValueError(f"filters must be out of {', '.join(FILTERS)}, got {', '.join(unknown) or 'none'}")
+    check_names(filters, FILTERS, "filters")
     folder = Path(out)
     stages = Stages(folder / "stages", say)
     ended = stop or (lambda: False)
@@ -182,8 +178,7 @@ def run_formation(
             summary["interrupted"] = True
             break
         recipe = _recipe(name, settings)
-        known = stages.path(name, recipe)
-        kept = known is not None and known.is_file()
+        kept = stages.has(name, recipe)
         results[name] = stages.get(name, recipe, lambda name=name: run_filter(name, scene, settings, gp, progress))  # type: ignore[misc]
         summary["paper"][name] = summarize(results[name], scene)
         say(f"{name:18s} " + ("as before" if kept else f"{float(results[name]['cpu_s']):.1f} s of CPU"))
@@ -197,8 +192,7 @@ def run_formation(
     for line in lines:
         say(line)
     if not summary["interrupted"]:
-        atomic_write(folder / TABLE, ("\n".join(lines).strip("\n") + "\n").encode())
-        atomic_write(folder / METRICS, (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode())
+        write_outcome(folder, lines, summary)
         if figures:
             from torchfilt.missions.figures import formation_figures
 

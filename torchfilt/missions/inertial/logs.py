@@ -4,7 +4,6 @@ Row 0 of a run has all fixes; each other row misses its own for the longest gap,
 """
 
 import hashlib
-import json
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -34,11 +33,10 @@ from torchfilt.missions.inertial.log_scene import (
     make_gaps,
     read_log,
 )
-from torchfilt.missions.stages import Arrays, Stages, versions
+from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
 from torchfilt.models.attitude import inverse, rotate, to_euler
 from torchfilt.particles import Particles
 from torchfilt.spaces import wrap_angle
-from torchfilt.storage import atomic_write
 from torchfilt.types import FilterState, StepInfo
 
 __all__ = [
@@ -51,7 +49,6 @@ __all__ = [
     "table",
 ]
 
-METRICS, TABLE = "metrics.json", "table.txt"
 # Results of another version of the arithmetic are not reused: raise this with it.
 _VERSION = 1
 # Slower than that, a car's course says little about where it is mounted.
@@ -429,9 +426,7 @@ def run_log(
     """
     log, own = settings.log, VARIANTS[settings.log]
     names = DEFAULT[log] if variants is None else tuple(variants)
-    unknown = [name for name in names if name not in own]
-    if unknown or not names:
-        raise ValueError(f"variants must be out of {', '.join(own)}, got {', '.join(unknown) or 'none'}")
+    check_names(names, own, "variants")
     folder = Path(out)
     stages = Stages(folder / "stages", say)
     data = read_log(settings)
@@ -447,8 +442,7 @@ def run_log(
     results: dict[str, Arrays] = {}
     for name in names:
         recipe = _recipe(settings, data, name)
-        path = stages.path(name, recipe)
-        before = path is not None and path.is_file()
+        before = stages.has(name, recipe)
         turned = mounting if own[name].aided else None
         results[name] = stages.get(
             name,
@@ -461,8 +455,7 @@ def run_log(
     lines = table(summary)
     for line in lines:
         say(line)
-    atomic_write(folder / TABLE, ("\n".join(lines).strip("\n") + "\n").encode())
-    atomic_write(folder / METRICS, (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode())
+    write_outcome(folder, lines, summary)
     if figures:
         from torchfilt.missions.inertial.logs_figures import log_figures
 

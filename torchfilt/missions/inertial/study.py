@@ -1,6 +1,5 @@
 """The SINS/SAR study as a run: stages that are kept, errors by group, consistency, a table, figures."""
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,13 +21,11 @@ from torchfilt.missions.inertial.scene import (
     make_scene,
     start_state,
 )
-from torchfilt.missions.stages import Arrays, Stages, versions
+from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
 from torchfilt.models.inertial.error_model import ERROR_SPACE
 from torchfilt.particles import Particles
 from torchfilt.recording import Series
-from torchfilt.storage import atomic_write
 
-METRICS, TABLE = "metrics.json", "table.txt"
 # Results of another version of the arithmetic are not reused: raise this with it.
 _VERSION = 1
 # Tangent components of the error, and what they are told in. Position, velocity and biases are lengths of vectors, tilt
@@ -161,9 +158,7 @@ def run_inertial(
         ValueError: unknown filter.
     """
     names = DEFAULT[settings.scenario] if filters is None else tuple(filters)
-    unknown = [name for name in names if name not in FILTERS]
-    if unknown or not names:
-        raise ValueError(f"filters must be out of {', '.join(FILTERS)}, got {', '.join(unknown) or 'none'}")
+    check_names(names, FILTERS, "filters")
     folder = Path(out)
     stages = Stages(folder / "stages", say)
     say(f"{settings.scenario}: {SCENARIOS[settings.scenario]}; {settings.runs} runs of {settings.steps} s")
@@ -176,8 +171,7 @@ def run_inertial(
     summary["filters"] = {}
     for name in names:
         recipe = _recipe(name, settings)
-        path = stages.path(name, recipe)
-        kept = path is not None and path.is_file()
+        kept = stages.has(name, recipe)
         results[name] = stages.get(name, recipe, lambda name=name: run_filter(name, scene, settings, progress))  # type: ignore[misc]
         summary["filters"][name] = summarize(results[name], measured)
         say(f"{name:12s} " + ("as before" if kept else f"{results[name]['cpu_s'].sum():.1f} s of CPU"))
@@ -185,8 +179,7 @@ def run_inertial(
     lines = table(summary)
     for line in lines:
         say(line)
-    atomic_write(folder / TABLE, ("\n".join(lines).strip("\n") + "\n").encode())
-    atomic_write(folder / METRICS, (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode())
+    write_outcome(folder, lines, summary)
     if figures:
         from torchfilt.missions.inertial.figures import inertial_figures
 
