@@ -2,10 +2,11 @@
 
 import math
 
+import mpmath
 import numpy as np
 import pytest
 import torch
-from scipy import integrate, optimize, stats
+from scipy import integrate, stats
 
 import torchfilt as tf
 from torchfilt.kernels import Regularize, optimal_bandwidth
@@ -35,18 +36,22 @@ def resampled(cloud, seed=3):
 
 @pytest.mark.parametrize("size", [1, 2, 5, 15])
 def test_gaussian_bandwidth_minimises_the_integrated_squared_error(size):
-    """Against the exact error for a Gaussian density (Wand and Jones, 1995, section 4.3), minimised numerically.
+    """Against the zero of the exact error's slope for a Gaussian density (Wand and Jones, 1995, section 4.3).
 
-    The formula is its limit for many particles; with n = 1e12 in one to five dimensions both agree to a few percent,
-    in fifteen, where the limit is far away, to a tenth.
+    The formula is its limit for many particles. With a = e / 2 + 1 the slope's next term makes the exact bandwidth
+    larger by the share 3 (a + 1) h^2 / (4 (e + 4)); what is left after it is of the order of its square.
     """
-    n = 1e12
+    n = 10**60
+    h = optimal_bandwidth(size, n)
+    a = mpmath.mpf(size) / 2 + 1
 
-    def error(h):
-        return h**-size / n + (1 - 1 / n) * (1 + h * h) ** (-size / 2) - 2 * (1 + h * h / 2) ** (-size / 2) + 1
+    def slope(h):
+        return -1 / (n * h ** (size + 1)) - (1 - mpmath.mpf(1) / n) * h * (1 + h**2) ** -a + h * (1 + h**2 / 2) ** -a
 
-    best = optimize.minimize_scalar(error, bounds=(1e-4, 1.0), method="bounded", options={"xatol": 1e-9}).x
-    assert optimal_bandwidth(size, int(n)) == pytest.approx(best, rel=0.1 if size == 15 else 0.04)
+    with mpmath.workdps(120):
+        best = float(mpmath.findroot(slope, h))
+    share = 0.75 * (size / 2 + 2) * h**2 / (size + 4)
+    assert best / h - 1 == pytest.approx(share, abs=10 * share**2 * (size + 4) + 1e-14)
 
 
 @pytest.mark.parametrize("size", [1, 2, 15])
