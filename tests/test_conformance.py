@@ -672,6 +672,9 @@ class BrokenSpace(Euclidean):
         mean = super().mean(points, weights)
         return points.mean(-2) if self.defect == "unweighted" else mean
 
+    def carry(self, v, columns):
+        return columns + v.unsqueeze(-1) if self.defect == "curved" else columns
+
     def observed(self, y):
         return torch.ones_like(y, dtype=torch.bool) if self.defect == "sees all" else super().observed(y)
 
@@ -681,6 +684,7 @@ class BrokenSpace(Euclidean):
     [
         ("sign", "local"),
         ("scale", "is v"),
+        ("curved", "change of chart"),
         ("mixes rows", "beside a row of NaN"),
         ("unweighted", "sum to zero"),
         ("sees all", "nothing is observed"),

@@ -17,7 +17,9 @@ from torchfilt.spaces import (
     Space,
     UnitQuaternion,
     centred,
+    curved_components,
     steady_sum,
+    transport,
     weighted_sum,
     wrap_angle,
 )
@@ -411,6 +413,38 @@ def test_derivatives_of_the_way_there_and_back(space, draw, turn):
     end = space.retract(x, v).detach().requires_grad_()
     if turn < 3.0:  # central differences of the rotations near half a turn would step over the cut
         assert torch.autograd.gradcheck(lambda a, b: space.local(space.project(a), space.project(b)), (x, end))
+
+
+@spaces
+@pytest.mark.parametrize("turn", [0.0, 1e-9, 0.05, 0.0999, 0.1001, 0.7, 3.0])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_errors_seen_from_another_point(space, draw, turn, dtype):
+    """Against the derivative of the two charts in float64; the series and the closed form meet at 0.1 rad."""
+    x = draw(2, seed=0)[0]
+    v = turn * torch.nn.functional.normalize(normals(space.tangent_size, seed=2), dim=0)
+    there = space.retract(x, v)
+    exact = torch.func.jacfwd(lambda e: space.local(there, space.retract(x, v + e)))(torch.zeros_like(v))
+    columns = normals(space.tangent_size, 4, seed=3)
+    carried = space.carry(v.to(dtype), columns.to(dtype))
+    assert carried.dtype == dtype
+    # 1 - cos a and a - sin a lose what a is below a turn: 1e3 roundings at most.
+    limit = 1e3 * torch.finfo(dtype).eps
+    torch.testing.assert_close(carried.double(), exact @ columns, rtol=0, atol=limit)
+
+
+@spaces
+def test_a_factor_is_transported_as_its_covariance(space, draw):
+    e = space.tangent_size
+    v = 0.5 * normals(3, e, seed=4)
+    factor = torch.linalg.cholesky(torch.eye(e, dtype=torch.float64) + 0.5)
+    moved = transport(space, v, factor)
+    jacobian = space.carry(v, torch.eye(e, dtype=torch.float64))
+    torch.testing.assert_close(
+        moved @ moved.mT, (jacobian @ factor @ factor.mT @ jacobian.mT).expand_as(moved @ moved.mT)
+    )
+    assert torch.equal(moved, moved.tril())
+    changed = set((jacobian - torch.eye(e)).abs().amax(-1).nonzero()[:, -1].tolist()) if jacobian.dim() > 2 else set()
+    assert changed == set(curved_components(space, e))
 
 
 @spaces

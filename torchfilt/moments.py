@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
 from torchfilt.linalg import apply_factor, cholesky_downdate, for_points, log_abs_diagonal, triangularize, whiten
-from torchfilt.spaces import EUCLIDEAN, Euclidean, Space
+from torchfilt.spaces import EUCLIDEAN, Euclidean, Space, transport
 from torchfilt.types import Missing
 
 Law = Callable[..., Gaussian]
@@ -387,8 +387,9 @@ def update(
         line = rule.linearize(law, posterior, u, dt)
         # slope S_posterior^-1 is the law's Jacobian; carry it back to the prior's own factor and mean.
         jacobian = torch.linalg.solve_triangular(posterior.factor(), line.slope, upper=False, left=False)
-        line = line._replace(slope=jacobian @ prior.factor())
-        back = apply_factor(jacobian, posterior.space.local(posterior.mean, prior.mean))
+        away = posterior.space.local(posterior.mean, prior.mean)
+        line = line._replace(slope=jacobian @ prior.space.carry(-away, prior.factor()))
+        back = apply_factor(jacobian, away)
         result = _condition(prior, line, back, y, observed)
     return result
 
@@ -429,7 +430,9 @@ def _condition(
     nis = z.square().sum(-1)
     constant = -0.5 * LOG_2PI * counted - log_abs_diagonal(innovation_factor)
     log_likelihood = torch.sub(constant, nis, alpha=0.5)
-    mean = prior.space.retract(prior.mean, apply_factor(gain, z))
+    move = apply_factor(gain, z)
+    mean = prior.space.retract(prior.mean, move)
+    posterior_factor = transport(prior.space, move, posterior_factor)
     if observed is not None:  # rows without any measurement keep the prior to the bit
         seen = observed.any(-1)
         mean = torch.where(seen.unsqueeze(-1), mean, prior.mean)

@@ -86,7 +86,7 @@ class Particles(NamedTuple):
         mean, errors = known[-2:] if known is not None else centred(self.space, self.x, weights)
         covariance = second_moment(errors, weights)
         if self.scale_tril is not None:
-            covariance = covariance + self._local_covariance(weights)
+            covariance = covariance + self._local_covariance(errors, weights)
         return mean, covariance
 
     def with_centre(self) -> "Particles":
@@ -106,9 +106,11 @@ class Particles(NamedTuple):
         same = known is not None and known.x is self.x and known.log_weights is self.log_weights
         return known if same and known is not None and known.space is self.space else None
 
-    def _local_covariance(self, weights: Tensor) -> Tensor:
+    def _local_covariance(self, errors: Tensor, weights: Tensor) -> Tensor:
+        """Mean of the particles' own covariances, each seen from the mean of all."""
         assert self.scale_tril is not None
-        own = self.scale_tril @ self.scale_tril.mT
+        factor = self.space.carry(-errors, self.scale_tril)
+        own = factor @ factor.mT
         if own.shape[-3] == 1:
             return own.squeeze(-3)
         return (own * weights[..., None, None]).sum(-3)

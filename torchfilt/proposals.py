@@ -11,7 +11,7 @@ from torchfilt.linalg import apply_factor, steady_triangularize
 from torchfilt.model import Conditional, StateSpaceModel, as_gaussian, log_likelihood, log_prob, sample
 from torchfilt.moments import Rule, check_rule_type, check_transition_space, predict, update
 from torchfilt.particles import Particles, uniform_log_weights
-from torchfilt.spaces import EUCLIDEAN, Space, weighted_sum
+from torchfilt.spaces import EUCLIDEAN, Space, transport, weighted_sum
 from torchfilt.types import StepInput
 
 Evidence = Literal["unbiased", "linearized", "approximate"]
@@ -237,11 +237,12 @@ class Local:
         factor, space = particles.scale_tril, particles.space
         assert factor is not None
         drawn = 1.0 if self.split is None else (1 - self.split) ** 0.5
-        x = particles.x if drawn == 0 else space.retract(particles.x, drawn * apply_factor(factor, noise))
+        away = drawn * apply_factor(factor, noise)
+        x = particles.x if drawn == 0 else space.retract(particles.x, away)
         if self.split == 0:
             return particles._replace(x=x, scale_tril=None)
         kept = 1.0 if self.split is None else self.split**0.5
-        return particles._replace(x=x, scale_tril=factor * kept)
+        return particles._replace(x=x, scale_tril=transport(space, away, factor * kept))
 
     def _pool(self, particles: Particles, noise: Tensor) -> Particles:
         assert self.split is not None and particles.scale_tril is not None
@@ -250,17 +251,18 @@ class Local:
         apart = space.local(mean.unsqueeze(-2), particles.x)
         # Cloud's covariance by one triangularisation of its columns, so that nothing is squared.
         root = weights.sqrt().unsqueeze(-1)
-        own = particles.scale_tril
-        own = own if own.shape[-3] == 1 else own * root.unsqueeze(-1)
+        factor = space.carry(-apart, particles.scale_tril)
+        own = factor if factor.shape[-3] == 1 else factor * root.unsqueeze(-1)
         columns = torch.cat([(apart * root).mT, own.movedim(-3, -2).flatten(-2)], -1)
         whole = steady_triangularize(columns)
-        drawn = apart + apply_factor(particles.scale_tril, noise)
+        drawn = apart + apply_factor(factor, noise)
         drawn = drawn - weighted_sum(drawn, weights).unsqueeze(-2)
         found = steady_triangularize((drawn * root).mT)
         # whole found^-1 takes the draws' covariance to the cloud's.
         matched = whole @ torch.linalg.solve_triangular(found, drawn.mT, upper=False)
-        x = space.retract(mean.unsqueeze(-2), ((1 - self.split) ** 0.5 * matched).mT)
-        return particles._replace(x=x, scale_tril=(self.split**0.5 * whole).unsqueeze(-3))
+        away = ((1 - self.split) ** 0.5 * matched).mT
+        factor = transport(space, away, (self.split**0.5 * whole).unsqueeze(-3))
+        return particles._replace(x=space.retract(mean.unsqueeze(-2), away), scale_tril=factor)
 
     def __call__(self, model: StateSpaceModel, particles: Particles, step: StepInput) -> Proposed:
         """One predicted and updated Gaussian a particle.

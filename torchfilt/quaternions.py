@@ -119,6 +119,36 @@ def logarithm(q: Quaternion) -> Vector:
     return q.axis[0] * scale, q.axis[1] * scale, q.axis[2] * scale
 
 
+def turned_by_jacobian(v: Vector, error: Vector) -> Vector:
+    """J(v) error, where exp(v + error) = exp(J(v) error) exp(v) to first order in the error: the left Jacobian.
+
+    J = I + (1 - cos a) / a^2 [v] + (a - sin a) / a^3 [v]^2 with a the length of v, at most a turn.
+    """
+    square = _square(v)
+    small = square < 1e-2
+    # Where the series is taken the other branch gets a harmless argument: derivatives of both are formed.
+    angle2 = torch.where(small, 1, square)
+    angle = angle2.sqrt()
+    first = torch.where(small, _series(square, _COSINE), 2 * (0.5 * angle).sin().square() / angle2)
+    second = torch.where(small, _series(square, _SINE), (angle - angle.sin()) / (angle2 * angle))
+    once = cross(v, error)
+    twice = cross(v, once)
+    x, y, z = (torch.addcmul(torch.addcmul(e, first, o), second, t) for e, o, t in zip(error, once, twice, strict=True))
+    return x, y, z
+
+
+# (1 - cos a) / a^2 and (a - sin a) / a^3 in powers of a^2: what is left out below 0.01 is less than rounding.
+_COSINE = (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600)
+_SINE = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800)
+
+
+def _series(x: Tensor, coefficients: Sequence[float]) -> Tensor:
+    total = torch.full_like(x, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        total = torch.add(x * total, coefficient)
+    return total
+
+
 def _square(v: Vector) -> Tensor:
     """Square of the length."""
     return torch.addcmul(torch.addcmul(v[0] * v[0], v[1], v[1]), v[2], v[2])

@@ -23,7 +23,7 @@ from torchfilt.moments import (
 )
 from torchfilt.particles import Particles, uniform_log_weights
 from torchfilt.proposals import Evidence, Prior, Proposed
-from torchfilt.spaces import EUCLIDEAN, Space
+from torchfilt.spaces import EUCLIDEAN, Space, curved_components
 from torchfilt.types import StepInput
 
 
@@ -272,6 +272,14 @@ class _Section(NamedTuple):
     def mean(self, points: Tensor, weights: Tensor) -> Tensor:
         """As the whole space."""
         return self.space.mean(points, weights)
+
+    def carry(self, v: Tensor, columns: Tensor) -> Tensor:
+        """As the whole space; where the linear components are flat nothing needs a particle axis."""
+        curved = curved_components(self.space, len(self.parts.linear) + len(self.parts.drawn))
+        if not set(curved) & set(self.parts.linear):
+            return columns
+        whole = self.space.carry(self.parts.spread(v, -1), self.parts.spread(columns, -2))
+        return self.parts.take(whole, -2)
 
     def observed(self, y: Tensor) -> Tensor:
         """Linear components that are there."""

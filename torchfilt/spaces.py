@@ -12,8 +12,17 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchfilt.linalg import is_differentiated
-from torchfilt.quaternions import conjugate, exponential, logarithm, product, quaternion, stack, vector
+from torchfilt.linalg import is_differentiated, triangularize
+from torchfilt.quaternions import (
+    conjugate,
+    exponential,
+    logarithm,
+    product,
+    quaternion,
+    stack,
+    turned_by_jacobian,
+    vector,
+)
 
 
 @runtime_checkable
@@ -46,6 +55,13 @@ class Space(Protocol):
         """Intrinsic mean of points (..., n, d) with weights (..., n) that sum to one."""
         ...
 
+    def carry(self, v: Tensor, columns: Tensor) -> Tensor:
+        """Small errors (..., e, k) about x as errors about ``retract(x, v)``; ``columns`` itself on a flat space.
+
+        The derivative of ``local(retract(x, v), retract(x, v + error))`` by the error, wherever x is.
+        """
+        ...
+
     def observed(self, y: Tensor) -> Tensor:
         """Which tangent components (..., e) of a measurement are there: NaN means not measured."""
         ...
@@ -69,6 +85,24 @@ def steady_sum(values: Tensor, dim: int) -> Tensor:
 def weighted_sum(values: Tensor, weights: Tensor) -> Tensor:
     """Sum over n of weights (..., n) times values (..., n, d): the same bits for any thread count."""
     return steady_sum(values * weights.unsqueeze(-1), -2)
+
+
+def transport(space: Space, v: Tensor, factor: Tensor) -> Tensor:
+    """Factor (..., e, e) of a covariance about x as one about ``retract(x, v)``, lower triangular again."""
+    carried = space.carry(v, factor)
+    return factor if carried is factor else triangularize(carried)
+
+
+def curved_components(space: Space, size: int) -> tuple[int, ...]:
+    """Which of ``size`` tangent components `Space.carry` may change."""
+    if isinstance(space, Product):
+        found, start = [], 0
+        for part in space.spaces:
+            own = int(part.tangent_size or 0)
+            found += [start + k for k in curved_components(part, own)]
+            start += own
+        return tuple(found)
+    return () if isinstance(space, Euclidean | Angle) else tuple(range(size))
 
 
 def centred(space: Space, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -108,6 +142,10 @@ class Euclidean:
     def mean(self, points: Tensor, weights: Tensor) -> Tensor:
         """Weighted sum."""
         return weighted_sum(points, weights)
+
+    def carry(self, v: Tensor, columns: Tensor) -> Tensor:
+        """The columns themselves."""
+        return columns
 
     def observed(self, y: Tensor) -> Tensor:
         """Each number on its own."""
@@ -165,6 +203,10 @@ class Angle:
         # The limit of the iteration does not depend on where it starts, and `atan2` has no derivative at zero.
         start = torch.where(vanishes, _heaviest(points, weights), torch.atan2(sine, cosine)).detach()
         return _intrinsic_mean(self, points, weights, start)
+
+    def carry(self, v: Tensor, columns: Tensor) -> Tensor:
+        """The columns themselves."""
+        return columns
 
     def observed(self, y: Tensor) -> Tensor:
         """Each angle on its own."""
@@ -235,6 +277,16 @@ class UnitQuaternion:
         start = self.project(torch.where(vanishes, heaviest, average).detach())
         return _intrinsic_mean(self, points, weights, start, curved=True)
 
+    def carry(self, v: Tensor, columns: Tensor) -> Tensor:
+        """Columns times the Jacobian of the exponential map, of the side of the error.
+
+        Source: Mueller, Hehn, D'Andrea, Covariance correction step for Kalman filtering with an attitude, JGCD 40
+            (2017), which takes its first two terms.
+        """
+        backward = v if self.side == "left" else -v
+        parts = turned_by_jacobian(vector(backward.unsqueeze(-1).unbind(-2)), vector(columns.unbind(-2)))
+        return stack(parts).mT
+
     def observed(self, y: Tensor) -> Tensor:
         """All of it or nothing."""
         return (~torch.isnan(y).any(-1, keepdim=True)).expand(*y.shape[:-1], 3)
@@ -297,6 +349,16 @@ class Product:
         parts = zip(self.spaces, points.split(self._sizes, -1), strict=True)
         means, errors = zip(*(centred(space, a, weights) for space, a in parts), strict=True)
         return _side_by_side(means), _side_by_side(errors)
+
+    def carry(self, v: Tensor, columns: Tensor) -> Tensor:
+        """Each part's rows by its own rule."""
+        rows = columns.split(self._tangent_sizes, -2)
+        parts = zip(self.spaces, v.split(self._tangent_sizes, -1), rows, strict=True)
+        carried = [space.carry(step, part) for space, step, part in parts]
+        if all(after is before for after, before in zip(carried, rows, strict=True)):
+            return columns
+        lead = torch.broadcast_shapes(*(part.shape[:-2] for part in carried))
+        return torch.cat([part.expand(*lead, *part.shape[-2:]) for part in carried], -2)
 
     def observed(self, y: Tensor) -> Tensor:
         """Each part by its own rule."""

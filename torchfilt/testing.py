@@ -691,6 +691,7 @@ def check_space(space: Space, points: Tensor, *, reach: float = 0.4, tolerance: 
         back = space.retract(points, space.local(points, points.flip(0)))
         away = _distance(space, back, points.flip(0))
         _require(away <= limit, f"{name}: retract(x, local(x, y)) must be y, it is {away:.3g} off")
+        _check_space_carry(name, space, points, steps, limit)
         _check_space_rows(name, space, points, steps, limit)
         _check_space_mean(name, space, points, reach, limit, generator)
         observed = space.observed(points)
@@ -700,6 +701,21 @@ def check_space(space: Space, points: Tensor, *, reach: float = 0.4, tolerance: 
         _require(bool(observed.all()), f"{name}: all components of a point without NaN are observed")
         nothing = space.observed(torch.full_like(points, torch.nan))
         _require(not bool(nothing.any()), f"{name}: nothing is observed of a point of NaN")
+
+
+def _check_space_carry(name: str, space: Space, points: Tensor, steps: Tensor, limit: float) -> None:
+    """Errors about x, seen from the end of a step, change as the derivative of the two charts says."""
+    there = space.retract(points, steps)
+    identity = torch.eye(steps.shape[-1], dtype=points.dtype, device=points.device)
+
+    def seen_from_there(error: Tensor) -> Tensor:
+        return space.local(there, space.retract(points, steps + error))
+
+    columns = torch.func.vmap(
+        lambda direction: torch.func.jvp(seen_from_there, (torch.zeros_like(steps),), (direction.expand_as(steps),))[1]
+    )(identity)
+    carried = space.carry(steps, identity).expand(*steps.shape, -1)
+    _near(f"{name}: carry is the derivative of the change of chart", carried, columns.movedim(0, -1), limit)
 
 
 def _check_space_rows(name: str, space: Space, points: Tensor, steps: Tensor, limit: float) -> None:

@@ -85,7 +85,11 @@ def test_feedback_is_an_explicit_correction_of_a_reference():
         seen = reference.T @ up  # the error is on the body's side: C = reference exp(e), so H = [seen x]
         H = cross(seen)
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + 0.09 * np.eye(3))
-        reference, P = reference @ exponential(K @ (y - seen)), P - K @ H @ P
+        e = K @ (y - seen)
+        a = np.linalg.norm(e)
+        # The reset: what is left of the error is seen from the new reference.
+        G = np.eye(3) - (1 - np.cos(a)) / a**2 * cross(e) + (a - np.sin(a)) / a**3 * cross(e) @ cross(e)
+        reference, P = reference @ exponential(e), G @ (P - K @ H @ P) @ G.T
 
     import roma
 
