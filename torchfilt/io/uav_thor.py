@@ -1,25 +1,19 @@
 """Reader of a small fixed-wing aircraft's flight: inertial sensors, magnetometer, barometer and satellite receiver.
 
-The file is MATLAB's; SciPy decodes it after its structure was checked here, since SciPy itself follows nested or vast
-arrays of a hostile file until the process dies. Units (degrees, gauss), axes (forward-right-down, north-east-down),
-the magnetometer's offsets, held fixes and the on-board filter's biases end here.
+Units (degrees, gauss), axes (forward-right-down, north-east-down), the magnetometer's offsets, held fixes and the
+on-board filter's biases end here.
 """
 
-import io
-import math
-import struct
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilt.io import files
-from torchfilt.io.files import LogError, read_digests, read_stored
+from torchfilt.io.files import LogError, read_digests
 from torchfilt.io.inertial import Gaps, GnssFixes, InertialLog, Reference, check_finite, check_fixes, check_samples
+from torchfilt.io.matlab import read_structure
 
 FILE = "thor_flight75_WaypointTracker_150squareWaypointNew_2012_10_10.mat"
 # Airspeed above 12 m/s.
@@ -128,15 +122,7 @@ def _swapped(vectors: Tensor) -> Tensor:
 
 def _read_fields(path: Path, digests: Mapping[str, str] | None) -> dict[str, Tensor]:
     """The needed fields of `flight_data`, each (t,) float64."""
-    from scipy.io import loadmat
-
-    stored = read_stored(path, digests)
-    try:
-        # SciPy's stubs know no streams.
-        safe: Any = io.BytesIO(_checked_matlab(stored, "flight_data"))
-        record = loadmat(safe, struct_as_record=False, squeeze_me=True)["flight_data"]
-    except (ValueError, TypeError, KeyError, OSError, OverflowError, struct.error, zlib.error) as error:
-        raise LogError(f"{path.name}: not a whole MATLAB 5 file with the structure flight_data: {error}") from error
+    record = read_structure(path, digests, "flight_data")
     absent = [name for name in _FIELDS if not hasattr(record, name)]
     if absent:
         raise LogError(f"{path.name}: flight_data has no field {', '.join(absent)}")
@@ -146,81 +132,3 @@ def _read_fields(path: Path, digests: Mapping[str, str] | None) -> dict[str, Ten
         if value.ndim != 1 or value.shape != rows:
             raise LogError(f"{path.name}: field {name} has shape {tuple(value.shape)}, time has {tuple(rows)}")
     return fields
-
-
-# Structure of MATLAB 5 files: elements of a type, a length and content, padded to 8 bytes; content of up to 4 bytes
-# may stand in the second half of the head. A matrix holds flags with its class, sizes, a name and its values.
-_MATRIX, _PACKED = 14, 15
-_STRUCTURE = 2
-_NUMBERS = range(6, 16)
-_COMPLEX = 0x0800
-
-
-class _Element(NamedTuple):
-    kind: int
-    content: memoryview
-    whole: memoryview
-
-
-def _elements(data: memoryview) -> Iterator[_Element]:
-    start = 0
-    while start < len(data):
-        kind, size = struct.unpack_from("<II", data, start)
-        if kind >> 16:
-            kind, size, first, end = kind & 0xFFFF, kind >> 16, start + 4, start + 8
-        else:
-            first = start + 8
-            # Packed elements are not padded.
-            end = first + size + (-size % 8 if kind != _PACKED else 0)
-        if first + size > len(data):
-            raise ValueError("an element ends behind the file")
-        yield _Element(kind, data[first : first + size], data[start:end])
-        start = end
-
-
-def _checked_matlab(stored: bytes, name: str) -> bytes:
-    """A MATLAB file of the one variable, which is a flat structure of real arrays that are as large as they say."""
-    if len(stored) < 128 or stored[124:128] != b"\x00\x01IM":
-        raise ValueError("no head of a little-endian MATLAB 5 file")
-    room, found = files.MAX_BYTES, []
-    for element in _elements(memoryview(stored)[128:]):
-        whole = element.whole
-        if element.kind == _PACKED:
-            unpacker = zlib.decompressobj()
-            unpacked = unpacker.decompress(element.content, room)
-            if not unpacker.eof:
-                raise ValueError(f"cut short, or more than the limit of {files.MAX_BYTES} bytes when unpacked")
-            room -= len(unpacked)
-            whole = memoryview(unpacked)
-        for variable in _elements(whole):
-            if variable.kind != _MATRIX:
-                raise ValueError(f"an element of type {variable.kind}, expected a matrix")
-            flags, sizes, label, *rest = _elements(variable.content)
-            if bytes(label.content) == name.encode():
-                _check_structure(flags, sizes, rest)
-                found.append(bytes(variable.whole))
-    if len(found) != 1:
-        raise ValueError(f"{len(found)} variables {name}")
-    return stored[:128] + found[0]
-
-
-def _check_structure(flags: _Element, sizes: _Element, rest: list[_Element]) -> None:
-    if flags.content[0] != _STRUCTURE or _count(sizes) != 1:
-        raise ValueError(f"class {flags.content[0]} with {_count(sizes)} entries, expected one structure")
-    for entry in rest[2:]:  # behind the length and the text of the names
-        parts = list(_elements(entry.content)) if entry.kind == _MATRIX else []
-        if len(parts) != 4:
-            raise ValueError("a field that is no plain array")
-        kind, extent, _, values = parts
-        (bits,) = struct.unpack_from("<I", kind.content)
-        if bits & 0xFF not in _NUMBERS or bits & _COMPLEX:
-            raise ValueError(f"a field of class {bits & 0xFF}, expected real numbers")
-        if _count(extent) > len(values.content):
-            raise ValueError("a field that is larger than its values")
-
-
-def _count(sizes: _Element) -> int:
-    entries = struct.unpack(f"<{len(sizes.content) // 4}i", sizes.content)
-    if len(entries) < 2 or min(entries) < 0:
-        raise ValueError(f"sizes {entries}")
-    return math.prod(entries)
