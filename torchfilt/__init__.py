@@ -25,6 +25,7 @@ from torchfilt.lazy import lazy_names
 from torchfilt.model import StateSpaceModel
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
+from torchfilt.sensors import PseudoMeasurement, Sensors
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
 from torchfilt.types import FilterError, FilterState, StepInfo, StepNoise
 
@@ -58,9 +59,11 @@ __all__ = [
     "ParticleFilter",
     "Particles",
     "Product",
+    "PseudoMeasurement",
     "RaoBlackwellizedParticleFilter",
     "RegularizedParticleFilter",
     "ResampleMoveParticleFilter",
+    "Sensors",
     "StateSpaceModel",
     "StepInfo",
     "StepNoise",
