@@ -9,6 +9,7 @@ from torch.distributions import Distribution
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import LinearGaussian, call_style, check_factor, check_finite, takes_in_order
 from torchfilt.linalg import psd_factor
+from torchfilt.symmetry import Gauge, GaugedInitial, GaugedTransition
 from torchfilt.types import Missing, StepInput
 
 Conditional = Gaussian | Distribution
@@ -31,6 +32,8 @@ class StateSpaceModel(nn.Module):
         transition: law called as ``transition(x, u, dt)``; arguments it does not take are left out.
         observation: law called as ``observation(x, u, dt)`` with the control and time step of the motion that led to x;
             arguments it does not take are left out.
+        gauge: symmetry of the model, a map of states (..., d) to the representative of their orbit, see
+            `torchfilt.symmetry`; applied to the prior and to each state that sets out on a motion. None for none.
 
     Raises:
         TypeError: initial is none of these, a law is not callable, linear laws of another dtype.
@@ -42,19 +45,27 @@ class StateSpaceModel(nn.Module):
         initial: Gaussian | Distribution | nn.Module,
         transition: Callable[..., Conditional],
         observation: Callable[..., Conditional],
+        *,
+        gauge: Gauge | None = None,
     ) -> None:
         super().__init__()
         for name, law in (("transition", transition), ("observation", observation)):
             if not callable(law):
                 raise TypeError(f"{name} must be a law, called as law(x) or law(x, u, dt), got {type(law).__name__}")
+        if gauge is not None and not callable(gauge):
+            raise TypeError(f"gauge must be a map of states, called as gauge(x), got {type(gauge).__name__}")
         self.initial = initial if isinstance(initial, nn.Module) else InitialLaw(initial)
         self.transition = transition
         self.observation = observation
+        self.gauge = gauge
+        self._check_linear_laws()
+        if gauge is not None:
+            self.initial = GaugedInitial(self.initial, gauge)
+            self.transition = transition = GaugedTransition(transition, gauge)
         laws = {"transition": transition, "observation": observation}
         self._styles = {name: call_style(law) for name, law in laws.items()}
         self._short_cuts = {name: _short_cuts(law) for name, law in laws.items()}
         self._direct = {name: bool(self._short_cuts[name]) and takes_in_order(law) for name, law in laws.items()}
-        self._check_linear_laws()
 
     def _check_linear_laws(self) -> None:
         """Linear laws show their sizes before anything runs."""
@@ -72,6 +83,10 @@ class StateSpaceModel(nn.Module):
                 raise ValueError(
                     f"the {name}'s matrix (..., {rows}, {columns}) does not fit a state of {mean.shape[-1]} numbers"
                 )
+
+    def representative(self, x: Tensor) -> Tensor:
+        """States (..., d) in the model's gauge, in which alone they can be compared; x itself without a symmetry."""
+        return x if self.gauge is None else self.gauge(x)
 
     def takes_controls(self) -> bool:
         """Whether a law has a place for a control u."""
