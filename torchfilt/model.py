@@ -19,9 +19,10 @@ _SHORT_CUTS = ("linear_form", "pooled", "first_order")
 
 
 def _short_cuts(law: Callable[..., Conditional]) -> list[str]:
-    """What the law offers, with the space that belongs to a linear form."""
+    """What the law offers, with the space that belongs to a linear form, and the sensors it is made of."""
     found = [name for name in _SHORT_CUTS if hasattr(law, name)]
-    return [*found, "space"] if found and hasattr(law, "space") else found
+    also = [name for name in ("names", "parts") if hasattr(law, name)]
+    return [*found, *also, "space"] if found and hasattr(law, "space") else [*found, *also]
 
 
 class StateSpaceModel(nn.Module):
@@ -65,7 +66,9 @@ class StateSpaceModel(nn.Module):
         laws = {"transition": transition, "observation": observation}
         self._styles = {name: call_style(law) for name, law in laws.items()}
         self._short_cuts = {name: _short_cuts(law) for name, law in laws.items()}
-        self._direct = {name: bool(self._short_cuts[name]) and takes_in_order(law) for name, law in laws.items()}
+        self._direct = {
+            name: any(hasattr(law, key) for key in _SHORT_CUTS) and takes_in_order(law) for name, law in laws.items()
+        }
 
     def _check_linear_laws(self) -> None:
         """Linear laws show their sizes before anything runs."""

@@ -341,7 +341,8 @@ def predict(law: Law, belief: Gaussian, rule: Rule, u: Tensor | None, dt: Tensor
 class Update(NamedTuple):
     """What a measurement did: posterior, log-likelihood (...), innovation (..., e) and its factor, NIS (...).
 
-    freedom: how many components were measured, (...), or one number for all.
+    freedom: how many components were taken in, (...), or one number for all. accepted, gate_nis: of a gate, one entry a
+    sensor, (..., sensors); None without one.
     """
 
     belief: Gaussian
@@ -350,6 +351,29 @@ class Update(NamedTuple):
     innovation_scale_tril: Tensor
     nis: Tensor
     freedom: Tensor | int
+    accepted: Tensor | None = None
+    gate_nis: Tensor | None = None
+
+
+class GateDecision(NamedTuple):
+    """What a gate lets through.
+
+    kept (..., e): components of the measurement that are taken in; accepted, nis (..., sensors); log_density (...):
+    what the refused ones add to the log-likelihood.
+    """
+
+    kept: Tensor
+    accepted: Tensor
+    nis: Tensor
+    log_density: Tensor
+
+
+class GateRule(Protocol):
+    """Decides about a measurement before it is taken in; `torchfilt.gates.Gate` is one."""
+
+    def __call__(
+        self, law: Any, space: Space, line: Linearization, innovation: Tensor, observed: Tensor | None
+    ) -> GateDecision: ...
 
 
 def update(
@@ -361,6 +385,7 @@ def update(
     iterations: int = 1,
     u: Tensor | None = None,
     dt: Tensor | float | None = None,
+    gate: GateRule | None = None,
 ) -> Update:
     """Belief given a measurement y (..., d_y), whose NaN components are marginalised exactly.
 
@@ -374,13 +399,17 @@ def update(
         iterations: above 1 the law is linearised again about the posterior: the iterated extended filter for `Taylor`,
             iterated posterior linearisation for quadratures.
         u, dt: control and time step of the motion that led here, for measurement laws that look at them.
+        gate: decides, at the first linearisation, what of the measurement is taken in.
 
     Source: Garcia-Fernandez, Svensson, Morelande, Särkkä, IEEE TSP 63 (2015), for the iterated form.
     """
     line = rule.linearize(law, prior, u, dt)
     if y.shape[-1] != line.mean.shape[-1]:
         raise ValueError(f"the measurement has {y.shape[-1]} numbers, the observation law gives {line.mean.shape[-1]}")
-    observed = _observed(line.space, y, missing)
+    observed, decision = _observed(line.space, y, missing), None
+    if gate is not None:
+        decision = gate(law, line.space, line, _innovation(line, y, observed), observed)
+        observed = decision.kept
     result = _condition(prior, line, None, y, observed)
     for _ in range(iterations - 1):
         posterior = result.belief
@@ -391,7 +420,18 @@ def update(
         line = line._replace(slope=jacobian @ prior.space.carry(-away, prior.factor()))
         back = apply_factor(jacobian, away)
         result = _condition(prior, line, back, y, observed)
-    return result
+    if decision is None:
+        return result
+    log_likelihood = result.log_likelihood + decision.log_density
+    return result._replace(log_likelihood=log_likelihood, accepted=decision.accepted, gate_nis=decision.nis)
+
+
+def _innovation(line: Linearization, y: Tensor, observed: Tensor | None) -> Tensor:
+    """Error (..., e) from the expected measurement to y, zero where nothing was observed."""
+    if observed is None:
+        return line.space.local(line.mean, y)
+    filled = torch.where(torch.isnan(y), line.mean, y)
+    return torch.where(observed, line.space.local(line.mean, filled), 0)
 
 
 def _observed(space: Space, y: Tensor, missing: Missing) -> Tensor | None:
@@ -410,8 +450,7 @@ def _condition(
     Source: Kailath, Sayed, Hassibi, Linear Estimation (2000), section 12.3, the array form.
     """
     top, negative = cat_columns(line.slope, line.spread()), line.negative
-    filled = y if observed is None else torch.where(torch.isnan(y), line.mean, y)
-    innovation = line.space.local(line.mean, filled)
+    innovation = _innovation(line, y, observed)
     if shift is not None:
         innovation = innovation - shift
     m = top.shape[-2]

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from torchfilt.gates import Gate
 from torchfilt.gaussian import Gaussian
 from torchfilt.linalg import apply_factor, steady_triangularize
 from torchfilt.model import Conditional, StateSpaceModel, as_gaussian, log_likelihood, log_prob, sample
@@ -32,6 +33,8 @@ class Proposed(NamedTuple):
     space: Space
     arrival: Conditional | None = None
     log_likelihood: Tensor | None = None
+    accepted: Tensor | None = None
+    gate_nis: Tensor | None = None
 
 
 class Proposal(Protocol):
@@ -147,9 +150,12 @@ class Local:
     Args:
         rule: moment rule.
         redraw, split, pooled, weights: see above.
+        gate: each particle decides for itself whether it takes a measurement in; one that refuses it is weighted by the
+            gate's ``outlier_log_density``. With marginal weights only.
+        iterations: linearisations of the measurement law, as in `torchfilt.moments.update`.
 
     Raises:
-        ValueError: split outside [0, 1], combinations that have no meaning.
+        ValueError: split outside [0, 1], iterations below 1, combinations that have no meaning.
 
     Sources: van der Merwe, Doucet, de Freitas, Wan, The unscented particle filter, NIPS 13 (2000); Liu and West,
     Combined parameter and state estimation (2001), for the pooled kernel.
@@ -160,9 +166,17 @@ class Local:
     split: float | None = 0.5
     pooled: bool = False
     weights: Weights = "marginal"
+    gate: Gate | None = None
+    iterations: int = 1
 
     def __post_init__(self) -> None:
         check_rule_type(self.rule)
+        if self.iterations < 1:
+            raise ValueError(f"iterations must be at least 1, got {self.iterations}")
+        if self.gate is not None and self.gate.outlier_log_density is None:
+            raise ValueError("a gate of many particles needs outlier_log_density, what a refused measurement weighs")
+        if self.gate is not None and self.weights == "joint":
+            raise ValueError("a gate goes with marginal weights: joint ones weigh points by the measurement law itself")
         if self.redraw not in ("never", "resample", "always"):
             raise ValueError(f"redraw must be 'never', 'resample' or 'always', got {self.redraw!r}")
         if self.weights not in ("marginal", "joint"):
@@ -181,7 +195,7 @@ class Local:
     @property
     def evidence(self) -> Evidence:
         """What the log-likelihood is worth, see `torchfilt.run.Filter`."""
-        if self.pooled or self.split is None:
+        if self.pooled or self.split is None or self.gate is not None:
             return "approximate"
         return "unbiased" if self.weights == "joint" else "linearized"
 
@@ -276,10 +290,18 @@ class Local:
             # Points that stand still have no law to be drawn from again: the measurement weights them.
             return Prior()(model, particles, step)
         predicted, arrival = self._predict(model, particles, step)
-        result = update(model.moments("observation"), predicted, step.y, self.rule, step.missing, u=step.u, dt=step.dt)
+        sensor = model.moments("observation")
+        result = update(sensor, predicted, step.y, self.rule, step.missing, self.iterations, step.u, step.dt, self.gate)
         posterior = result.belief
         if self.weights == "marginal":
-            return Proposed(posterior.mean, posterior.scale_tril, result.log_likelihood, posterior.space)
+            return Proposed(
+                posterior.mean,
+                posterior.scale_tril,
+                result.log_likelihood,
+                posterior.space,
+                accepted=result.accepted,
+                gate_nis=result.gate_nis,
+            )
         assert step.noise.proposal is not None
         x = posterior.sample(step.noise.proposal)
         ratio = log_prob(arrival, x, "none") - posterior.log_prob(x)

@@ -23,9 +23,11 @@ class FilterState(NamedTuple, Generic[B]):
 class StepInfo(NamedTuple):
     """What one step reports; entries that a filter does not have are None.
 
-    log_likelihood, ok, nis, ess, acceptance_rate, accepted (by a gate), particles (how many, where that varies):
-    (*batch). innovation (*batch, e_y) and its factor (*batch, e_y, e_y), or (e_y, e_y) where all rows share it;
-    ancestors (*batch, n). A history stacks them along time.
+    log_likelihood, ok, nis, ess, acceptance_rate, particles (how many, where that varies): (*batch). innovation
+    (*batch, e_y) and its factor (*batch, e_y, e_y), or (e_y, e_y) where all rows share it; ancestors (*batch, n).
+    accepted, gate_nis (*batch), with `Sensors` (*batch, sensors): what a gate took in, in a bank by the heavier half of
+    its members, and the squared innovation it was told by, in a bank their weighted mean. restarted (*batch): by
+    `Reacquire`. A history stacks them along time.
     evidence says what log_likelihood is, see `torchfilt.run.Filter`: "approximate" where the form biases it.
     """
 
@@ -38,6 +40,8 @@ class StepInfo(NamedTuple):
     ancestors: Tensor | None = None
     acceptance_rate: Tensor | None = None
     accepted: Tensor | None = None
+    gate_nis: Tensor | None = None
+    restarted: Tensor | None = None
     particles: Tensor | None = None
     evidence: str | None = None
 

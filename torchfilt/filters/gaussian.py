@@ -1,8 +1,8 @@
 """Gaussian filters: one square-root recursion, one moment rule; the named methods differ by the rule."""
 
-import torch
 from torch import Tensor
 
+from torchfilt.gates import Gate, as_gate, by_sensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.model import StateSpaceModel
 from torchfilt.moments import (
@@ -31,23 +31,24 @@ class GaussianFilter(Filter[Gaussian]):
         model: the three laws; laws that are not Gaussian enter by their first two moments.
         rule: how moments go through a law: `taylor()`, `unscented()`, `cubature()`, `gauss_hermite()`.
         iterations: linearisations of the measurement law, each about the posterior of the one before.
-        gate: probability with which a measurement that fits is taken in, such as 0.999; the others, by the chi-square
-            test of their innovation, are treated as not measured and reported in ``info.accepted``. None takes all.
+        gate: a `Gate`, or the probability with which a measurement that fits is taken in, such as 0.999; the others, by
+            the chi-square test of their innovation, are treated as not measured. ``info.accepted`` and
+            ``info.gate_nis`` are the log: (*batch), with `Sensors` (*batch, sensors). None takes all.
 
     Raises:
-        ValueError: iterations below 1, gate outside (0, 1). TypeError: not a model, not a moment rule.
+        ValueError: iterations below 1, gate outside (0, 1). TypeError: not a model, not a moment rule, not a gate.
     """
 
     carries = Gaussian
 
-    def __init__(self, model: StateSpaceModel, rule: Rule, iterations: int = 1, gate: float | None = None) -> None:
+    def __init__(
+        self, model: StateSpaceModel, rule: Rule, iterations: int = 1, gate: Gate | float | None = None
+    ) -> None:
         super().__init__(model)
         check_rule_type(rule)
         if iterations < 1:
             raise ValueError(f"iterations must be at least 1, got {iterations}")
-        if gate is not None and not 0 < gate < 1:
-            raise ValueError(f"gate must be a probability in (0, 1) or None, got {gate}")
-        self.rule, self.iterations, self.gate = rule, iterations, gate
+        self.rule, self.iterations, self.gate = rule, iterations, as_gate(gate)
         self.evidence = "exact" if model.is_linear() else "linearized"
         if gate is not None:
             self.evidence = "approximate"  # what was shut out is not in it
@@ -70,7 +71,8 @@ class GaussianFilter(Filter[Gaussian]):
         self, belief: Gaussian, y: Tensor, missing: Missing = "rows", u: Tensor | None = None, dt: Step = None
     ) -> Update:
         """Belief after a measurement y (*batch, m), with innovation and likelihood; arguments as in `advance`."""
-        return update(self.model.moments("observation"), belief, y, self.rule, missing, self.iterations, u, dt)
+        law = self.model.moments("observation")
+        return update(law, belief, y, self.rule, missing, self.iterations, u, dt, self.gate)
 
     def advance(
         self,
@@ -86,9 +88,6 @@ class GaussianFilter(Filter[Gaussian]):
         if predict:
             belief = self.predict(belief, u, dt)
         result = self.update(belief, y, missing, u, dt)
-        accepted = None
-        if self.gate is not None:
-            result, accepted = _shut_out(result, belief, 1 - self.gate)
         posterior = result.belief
         # A factor made by a triangularisation cannot lose definiteness but by NaN; a failed downdate is NaN as well.
         # NaN and infinity survive a sum, and only what is neither leaves nothing when it is taken from itself.
@@ -100,22 +99,11 @@ class GaussianFilter(Filter[Gaussian]):
             result.innovation,
             result.innovation_scale_tril,
             result.nis,
-            accepted=accepted,
+            accepted=by_sensor(result.accepted, self.model),
+            gate_nis=by_sensor(result.gate_nis, self.model),
             evidence=self.evidence,
         )
         return posterior, info
-
-
-def _shut_out(result: Update, prior: Gaussian, level: float) -> tuple[Update, Tensor]:
-    """The prior again in rows whose innovation has a probability below ``level``; with which rows were taken in."""
-    freedom = torch.as_tensor(result.freedom, dtype=result.nis.dtype, device=result.nis.device)
-    chance = torch.special.gammaincc(freedom.clamp_min(1) / 2, result.nis / 2)
-    accepted = ~(chance < level)  # a failed row, NaN, stays what it is
-    after = result.belief
-    mean = torch.where(accepted.unsqueeze(-1), after.mean, prior.mean)
-    factor = torch.where(accepted[..., None, None], after.scale_tril, prior.factor())
-    log_likelihood = torch.where(accepted, result.log_likelihood, 0)
-    return result._replace(belief=Gaussian(mean, factor, after.space), log_likelihood=log_likelihood), accepted
 
 
 def KalmanFilter(model: StateSpaceModel) -> GaussianFilter:
@@ -146,7 +134,7 @@ def ExtendedKalmanFilter(model: StateSpaceModel, iterations: int = 1) -> Gaussia
 
 
 def ErrorStateKalmanFilter(
-    model: StateSpaceModel, feedback: bool = True, iterations: int = 1, gate: float | None = None
+    model: StateSpaceModel, feedback: bool = True, iterations: int = 1, gate: Gate | float | None = None
 ) -> GaussianFilter:
     """The indirect form: a reference that moves by the full law, and a Gaussian over its error in the tangent space.
 
@@ -185,12 +173,16 @@ def UnscentedKalmanFilter(
     beta: float = 0.0,
     kappa: float | None = None,
     iterations: int = 1,
+    gate: Gate | float | None = None,
 ) -> GaussianFilter:
     """Statistical linearisation by 2e + 1 sigma points; parameters as in `torchfilt.moments.unscented`.
 
+    On a space with a `UnitQuaternion` this is the quaternion filter: sigma points are turned by rotation vectors, their
+    mean is intrinsic, and the covariance goes along to the new mean.
+
     Source: Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proc. IEEE 92 (2004).
     """
-    return GaussianFilter(model, unscented(alpha, beta, kappa), iterations)
+    return GaussianFilter(model, unscented(alpha, beta, kappa), iterations, gate)
 
 
 def CubatureKalmanFilter(model: StateSpaceModel, iterations: int = 1) -> GaussianFilter:

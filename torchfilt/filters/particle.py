@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from torchfilt.gates import by_sensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.kernels import Regularize, check_kernel
 from torchfilt.linalg import for_points
@@ -200,12 +201,15 @@ class ParticleFilter(Filter[Particles]):
             after, rate = self.move(self.model, belief, after, step, *known, used=ok)
         if self.kernel is not None:
             after = after.with_centre()  # the next step needs it, as whoever records the mean does
+        accepted, gate_nis = _verdict(proposed, after.weights)
         info = StepInfo(
             log_likelihood,
             ok,
             ess=after.ess,
             ancestors=ancestors,
             acceptance_rate=rate,
+            accepted=by_sensor(accepted, self.model),
+            gate_nis=by_sensor(gate_nis, self.model),
             particles=alive,
             evidence=self.evidence,
         )
@@ -381,6 +385,14 @@ def _laid_out_as(like: Tensor, values: Tensor) -> Tensor:
     if torch.compiler.is_compiling() or values.shape != like.shape or values.stride() == like.stride():
         return values
     return torch.empty_like(like).copy_(values)
+
+
+def _verdict(proposed: Proposed, weights: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """What the heavier half of the particles took in, and the mean of what they decided by, (*batch, sensors)."""
+    if proposed.accepted is None or proposed.gate_nis is None:
+        return None, None
+    share = weights.unsqueeze(-1)
+    return (share * proposed.accepted).sum(-2) >= 0.5, (share * proposed.gate_nis).sum(-2)
 
 
 def _tangent_size(initial: Conditional) -> int:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from torchfilt.filters.particle import ParticleFilter
+from torchfilt.gates import Gate
 from torchfilt.kernels import Regularize
 from torchfilt.model import StateSpaceModel
 from torchfilt.moments import Rule, taylor, unscented
@@ -58,13 +59,17 @@ def LocallyLinearizedParticleFilter(
     pooled: bool = False,
     weights: Weights = "marginal",
     resampler: Resampler | None = None,
+    gate: Gate | None = None,
+    iterations: int = 1,
 ) -> ParticleFilter:
     """A bank of Gaussian filters with weights: the same loop and proposal as the unscented particle filter.
 
     Particles start as draws that hold the share 1 - split of the prior's covariance and are not redrawn, because
-    drawing from a covariance that is also kept counts it twice.
+    drawing from a covariance that is also kept counts it twice. Works on any space, so that with a `UnitQuaternion` in
+    it each particle is a quaternion filter of its own. The literal form draws each particle anew at every step and
+    weights it by prior times likelihood over proposal: ``redraw="always", split=None, weights="joint"``.
     """
-    local = Local(rule or unscented(), redraw, split, pooled, weights)
+    local = Local(rule or unscented(), redraw, split, pooled, weights, gate, iterations)
     return ParticleFilter(model, particles, local, resampler or ess_below(0.5))
 
 
