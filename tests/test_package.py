@@ -55,7 +55,7 @@ LAYERS = [
     ["gaussian", "particles", "noise"],
     ["types"],
     ["moments", "resampling", "laws", "history"],
-    ["symmetry", "gates"],
+    ["symmetry", "gates", "mixture"],
     ["model", "gp", "recording", "kernels", "sensors"],
     ["proposals", "moves", "models"],
     ["run", "rao_blackwell"],

@@ -18,6 +18,7 @@ from torchfilt.filters import (
     UnscentedKalmanFilter,
     UnscentedParticleFilter,
 )
+from torchfilt.gates import Gate
 from torchfilt.gaussian import Gaussian
 from torchfilt.history import History
 from torchfilt.laws import AdditiveGaussian, LinearGaussian
@@ -25,6 +26,7 @@ from torchfilt.lazy import lazy_names
 from torchfilt.model import StateSpaceModel
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
+from torchfilt.robust import Reacquire
 from torchfilt.sensors import PseudoMeasurement, Sensors
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
 from torchfilt.types import FilterError, FilterState, StepInfo, StepNoise
@@ -48,6 +50,7 @@ __all__ = [
     "FilterError",
     "FilterState",
     "GPTransition",
+    "Gate",
     "GaussHermiteKalmanFilter",
     "Gaussian",
     "GaussianFilter",
@@ -61,6 +64,7 @@ __all__ = [
     "Product",
     "PseudoMeasurement",
     "RaoBlackwellizedParticleFilter",
+    "Reacquire",
     "RegularizedParticleFilter",
     "ResampleMoveParticleFilter",
     "Sensors",

@@ -11,7 +11,7 @@ from torchfilt.gaussian import Gaussian
 from torchfilt.particles import Particles, PastStep
 from torchfilt.spaces import EUCLIDEAN, Angle, Euclidean, Product, Space, UnitQuaternion
 from torchfilt.storage import NOT_OURS, IntegrityError, read_arrays, write_arrays
-from torchfilt.types import FilterState, StepInfo
+from torchfilt.types import FilterState, Guarded, StepInfo, trusted
 
 FILE_KIND = "torchfilt history"
 
@@ -80,7 +80,7 @@ class History:
 
     def save(self, path: str | Path) -> None:
         """Write an NPZ (no pickle) with its SHA-256 manifest, atomically; the final state is in it."""
-        final = self.final.belief
+        final = trusted(self.final.belief)
         kind = "gaussian" if isinstance(final, Gaussian) else "particles"
         head = {
             "belief": kind,
@@ -97,6 +97,10 @@ class History:
             if belief is not None:
                 named = belief._asdict()
                 parts |= {f"{prefix}.{name}": named[name] for name in named if isinstance(named[name], Tensor)}
+        if isinstance(self.final.belief, Guarded):
+            fallback, head["guarded"] = self.final.belief.fallback, True
+            parts |= {"fallback.mean": fallback.mean, "fallback.scale_tril": fallback.scale_tril}
+            parts["refused_s"] = self.final.belief.refused_s
         if isinstance(final, Particles):  # made on another way than from log_weights they differ in the last bit
             parts["final.weights"] = final.weights
             head["past"] = [_past_to_plain(part, f"final.past.{k}", parts) for k, part in enumerate(final.past)]
@@ -115,6 +119,9 @@ class History:
             tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
             space = space_from_plain(head["space"])
             final = _belief(tensors, "final", head, space)
+            if head.get("guarded"):
+                fallback = Gaussian(tensors["fallback.mean"], tensors["fallback.scale_tril"], space)
+                final = Guarded(final, fallback, tensors["refused_s"])
             recorded = {name for name in tensors if name.startswith("beliefs.")}
             beliefs = _belief(tensors, "beliefs", head, space) if recorded else None
             optional: dict[str, Any] = {name: tensors.get(f"info.{name}") for name in StepInfo._fields[2:]}

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.history import History
 from torchfilt.particles import Particles
-from torchfilt.types import FilterState, StepInfo
+from torchfilt.types import FilterState, Guarded, StepInfo, trusted
 
 Record = Literal["mean", "moments", "beliefs"]
 # Below so many numbers a step, keeping references and stacking them at the end takes fewer calls than copying at once.
@@ -104,8 +104,9 @@ class Recorder:
         self.series: dict[str, Series] = {}
         self.at_once = False
 
-    def add(self, belief: Gaussian | Particles, info: StepInfo) -> None:
+    def add(self, belief: Gaussian | Particles | Guarded, info: StepInfo) -> None:
         """Take in one step."""
+        belief = trusted(belief)
         if not self.series and isinstance(belief, Particles):
             self.at_once = belief.x.numel() >= _LARGE
         if isinstance(belief, Gaussian):
@@ -149,7 +150,7 @@ class Recorder:
         report: dict[str, Any] = {name: found.get(f"info.{name}") for name in StepInfo._fields}
         info = StepInfo(**{**report, "evidence": self.evidence})
         beliefs: Gaussian | Particles | None = None
-        if isinstance(final.belief, Gaussian) and "scale_tril" in found:
+        if isinstance(trusted(final.belief), Gaussian) and "scale_tril" in found:
             factor = found["scale_tril"]
             # Room for batch dims where all rows share one factor a step.
             factor = factor.reshape(len(factor), *[1] * (mean.dim() + 1 - factor.dim()), *factor.shape[1:])

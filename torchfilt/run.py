@@ -1,7 +1,7 @@
 """The one driver of every filter: the same step offline and in a stream."""
 
-from collections.abc import Iterator
-from typing import Any, Generic, Literal, TypeVar
+from collections.abc import Iterator, Mapping
+from typing import Any, Generic, Literal
 
 import torch
 from torch import Tensor, nn
@@ -11,9 +11,9 @@ from torchfilt.history import History
 from torchfilt.model import StateSpaceModel
 from torchfilt.particles import Particles
 from torchfilt.recording import Record, Recorder
-from torchfilt.types import FilterError, FilterState, Missing, Step, StepInfo, StepNoise
+from torchfilt.types import B, FilterError, FilterState, Guarded, Missing, Step, StepInfo, StepNoise, trusted
 
-B = TypeVar("B", Gaussian, Particles)
+Belief = Gaussian | Particles | Guarded
 Evidence = Literal["exact", "unbiased", "linearized", "approximate"]
 
 
@@ -31,7 +31,7 @@ class Filter(nn.Module, Generic[B]):
     """
 
     evidence: Evidence = "exact"
-    carries: type[Gaussian] | type[Particles]
+    carries: type[Gaussian] | type[Particles] | type[Guarded]
 
     def __init__(self, model: StateSpaceModel) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class Filter(nn.Module, Generic[B]):
     def step(
         self,
         state: FilterState[B],
-        y: Tensor,
+        y: Tensor | Mapping[str, Tensor | None],
         u: Tensor | None = None,
         dt: Step = None,
         *,
@@ -86,7 +86,7 @@ class Filter(nn.Module, Generic[B]):
 
         Args:
             state: of `init` or of the step before.
-            y: (*batch, m); NaN means not measured.
+            y: (*batch, m); NaN means not measured. With `Sensors` also by name, (*batch, m_i) each, silent ones absent.
             u: control (*batch, k) or (k,).
             dt: number or (*batch), s.
             predict_first: False where the measurement belongs to the time of the prior itself.
@@ -100,6 +100,8 @@ class Filter(nn.Module, Generic[B]):
         """
         self._check_state(state)
         batch = _batch_of(state.belief)
+        if isinstance(y, Mapping):
+            y = self._packed(y, tuple(batch), _like(state.belief))
         _check_tensor(y, "y")
         if y.dim() == 0:
             raise ValueError("y must be (*batch, m), got a tensor without dims")
@@ -121,6 +123,16 @@ class Filter(nn.Module, Generic[B]):
             raise FilterError(_failure(info.ok, state.step, y))
         return FilterState(belief, state.step + 1, state.seed), info
 
+    def _packed(self, named: Mapping[str, Tensor | None], lead: tuple[int, ...] | None, like: Tensor) -> Tensor:
+        """Measurements by name as one tensor."""
+        pack = getattr(self.model.observation, "pack", None)
+        if pack is None:
+            raise TypeError(
+                f"measurements by name need Sensors as the measurement law, got {type(self.model.observation).__name__}"
+            )
+        packed: Tensor = pack(named, lead, like)
+        return packed
+
     def _check_taken(self, u: Tensor, name: str) -> None:
         """A control that no law would look at is a mistake."""
         if not self.model.takes_controls():
@@ -128,7 +140,7 @@ class Filter(nn.Module, Generic[B]):
 
     def forward(
         self,
-        measurements: Tensor,
+        measurements: Tensor | Mapping[str, Tensor | None],
         controls: Tensor | None = None,
         dt: Step = None,
         *,
@@ -142,7 +154,7 @@ class Filter(nn.Module, Generic[B]):
         """Filter whole series.
 
         Args:
-            measurements: (t, *batch, m); NaN means not measured.
+            measurements: (t, *batch, m); NaN means not measured. With `Sensors` also by name, (t, *batch, m_i) each.
             controls: (t, k) shared by the batch, or (t, *batch, k).
             dt: time steps, s: a number (a tensor too), (t,) or (t, *batch).
             predict_first: False where the first measurement belongs to the time of the prior itself.
@@ -160,6 +172,8 @@ class Filter(nn.Module, Generic[B]):
             FilterError: a row failed; the message names the first step, the rows and the measurement.
             TypeError, ValueError: dtype, shape, values that are not finite; the first bad entry is named.
         """
+        if isinstance(measurements, Mapping):
+            measurements = self._packed(measurements, None, _like(state.belief if state else self.model.prior()))
         _check_tensor(measurements, "measurements")
         if measurements.dim() < 2 or len(measurements) == 0:
             raise ValueError(f"measurements must be (t, *batch, m) with t >= 1, got {tuple(measurements.shape)}")
@@ -222,28 +236,34 @@ def _check_step_dtype(dt: Tensor, y: Tensor) -> None:
         raise TypeError(f"dt must have the model's dtype {y.dtype}, got {dt.dtype}")
 
 
-def _batch_of(belief: Gaussian | Particles) -> torch.Size:
-    return belief.mean.shape[:-1] if isinstance(belief, Gaussian) else belief.x.shape[:-2]
+def _like(belief: Belief) -> Tensor:
+    """Means (*batch, d) or particles (*batch, n, d)."""
+    own = trusted(belief)
+    return own.x if isinstance(own, Particles) else own.mean
+
+
+def _batch_of(belief: Belief) -> torch.Size:
+    return _like(belief).shape[: -1 if isinstance(trusted(belief), Gaussian) else -2]
 
 
 # The largest block whose release still raises glibc's thresholds.
 _LARGEST_BLOCK = 32 * 2**20 - 2**16
 
 
-def _keep_memory(belief: Gaussian | Particles) -> None:
+def _keep_memory(belief: Belief) -> None:
     """Teach the C allocator to keep blocks of a cloud's size: it returns them to the system at each step otherwise.
 
     glibc raises its thresholds when a large block is released; an empty block that is never touched costs nothing.
     """
-    largest = belief.x if isinstance(belief, Particles) else belief.mean
+    largest = _like(belief)
     if largest.device.type == "cpu":
         wanted = 16 * largest.numel() * largest.element_size()
         torch.empty(min(wanted, _LARGEST_BLOCK), dtype=torch.uint8)
 
 
-def _check_measurements(y: Tensor, belief: Gaussian | Particles, name: str, batch: torch.Size) -> None:
+def _check_measurements(y: Tensor, belief: Belief, name: str, batch: torch.Size) -> None:
     """Dtype and batch as the belief's, no infinities."""
-    like = belief.mean if isinstance(belief, Gaussian) else belief.x
+    like = _like(belief)
     if y.dtype != like.dtype:
         raise TypeError(f"{name} must have the model's dtype {like.dtype}, got {y.dtype}")
     if batch != _batch_of(belief):

@@ -6,10 +6,44 @@ from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
 from torchfilt.particles import Particles
+from torchfilt.spaces import Space
 
-B = TypeVar("B", Gaussian, Particles)
 Step = Tensor | float | None
 Missing = Literal["none", "shared", "rows"]
+
+
+class Guarded(NamedTuple):
+    """A belief beside the one to fall back on, which never saw a certain sensor; what `Reacquire` carries.
+
+    refused_s (*batch): for how long that sensor has been refused.
+    """
+
+    belief: Gaussian | Particles
+    fallback: Gaussian
+    refused_s: Tensor
+
+    @property
+    def space(self) -> Space:
+        """Where the state lives."""
+        return self.belief.space
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean (*batch, d) of the belief."""
+        return self.belief.mean
+
+    @property
+    def covariance(self) -> Tensor:
+        """Covariance (*batch, e, e) of the belief."""
+        return self.belief.covariance
+
+
+B = TypeVar("B", Gaussian, Particles, Guarded)
+
+
+def trusted(belief: Gaussian | Particles | Guarded) -> Gaussian | Particles:
+    """The belief itself, without what stands beside it."""
+    return belief.belief if isinstance(belief, Guarded) else belief
 
 
 class FilterState(NamedTuple, Generic[B]):
@@ -51,7 +85,8 @@ class StepNoise(NamedTuple):
 
     proposal (*batch, n, e) standard normals or None; resampling (*batch, k) uniforms; redraw (*batch, n, e) or None;
     move_normal (moves, states, *batch, n, e) and move_uniform (moves, *batch, n), or None; kernel (*batch, n, k)
-    normals of a regularisation, or None; seed: for laws that draw by themselves.
+    normals of a regularisation, or None; seed: for laws that draw by themselves; restart (2, *batch, n, e) normals of
+    particles that are drawn anew from a Gaussian, or None.
     """
 
     proposal: Tensor | None
@@ -61,6 +96,7 @@ class StepNoise(NamedTuple):
     move_uniform: Tensor | None = None
     kernel: Tensor | None = None
     seed: int = 0
+    restart: Tensor | None = None
 
 
 class StepInput(NamedTuple):

@@ -21,7 +21,7 @@ from torchfilt.run import Filter
 from torchfilt.types import FilterState, Missing, Step, StepInfo, StepInput, StepNoise
 
 # Purposes of random numbers: each has a sequence of its own.
-_INITIAL, _INITIAL_SPLIT, _STEP, _MOVE, _ACCEPT, _OWN, _KERNEL = range(7)
+_INITIAL, _INITIAL_SPLIT, _STEP, _MOVE, _ACCEPT, _OWN, _KERNEL, _RESTART = range(8)
 
 
 class ParticleFilter(Filter[Particles]):
@@ -123,6 +123,11 @@ class ParticleFilter(Filter[Particles]):
         split = source.normal((*shape, self.tangent_size), 0, _INITIAL_SPLIT, like)
         return FilterState(self.proposal.start(initial, draws, split), 0, seed)
 
+    def around(self, belief: Gaussian, normals: Tensor) -> Particles:
+        """Particles of a Gaussian with mean (*batch, d), by normals (2, *batch, n, e)."""
+        draws = _draw_initial(belief, normals[0], tuple(normals.shape[1:-1]), 0)
+        return self.proposal.start(belief, draws, normals[1])
+
     def draw(self, belief: Particles, step: int, seed: int) -> StepNoise:
         """Random numbers of a step, a function of (seed, step) alone."""
         source = NoiseSource(seed, self.fast_normals)
@@ -151,6 +156,12 @@ class ParticleFilter(Filter[Particles]):
             kernel,
             source.seed_of(step, _OWN),
         )
+
+    def draw_with_restart(self, belief: Particles, step: int, seed: int) -> StepNoise:
+        """As `draw`, with the normals that `around` takes."""
+        source = NoiseSource(seed, self.fast_normals)
+        shape = (2, *belief.x.shape[:-2], self.particles, self.tangent_size)
+        return self.draw(belief, step, seed)._replace(restart=source.normal(shape, step + 1, _RESTART, belief.x))
 
     def _draw_motion(
         self, shape: tuple[int, ...], source: NoiseSource, generator: torch.Generator, like: Tensor
