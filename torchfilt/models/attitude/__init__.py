@@ -1,5 +1,6 @@
-"""Attitude: rotations and the one place of the models that knows a quaternion's order (x y z w, Hamilton)."""
+"""Attitude: rotations and laws, the one place of the models that knows a quaternion's order (x y z w, Hamilton)."""
 
+from torchfilt.models.attitude.kinematics import ATTITUDE_SPACE, GyroTransition, VectorMeasurement, plausible
 from torchfilt.models.attitude.rotations import (
     from_euler,
     from_matrix,
@@ -18,6 +19,9 @@ from torchfilt.models.attitude.rotations import (
 )
 
 __all__ = [
+    "ATTITUDE_SPACE",
+    "GyroTransition",
+    "VectorMeasurement",
     "from_euler",
     "from_matrix",
     "from_rotation_vector",
@@ -25,6 +29,7 @@ __all__ = [
     "mean_rotation",
     "multiply",
     "ned_frd_to_enu_rfu",
+    "plausible",
     "rotate",
     "skew",
     "swap_enu_ned",
