@@ -1,0 +1,72 @@
+"""Figures of the landing study: paths before and after the beacon is seen, errors and convergence against time."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchfilt.missions.landing.scene import Scene
+from torchfilt.missions.stages import Arrays
+
+_BEFORE_S, _AFTER_S = 2.0, 11.0
+
+
+def landing_figures(results: dict[str, Arrays], scene: Scene, folder: Path) -> list[Path]:
+    """Draw them; returns the files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return [_errors(results, scene, folder / "errors.png"), _paths(results, scene, folder / "paths.png")]
+
+
+def _since_sight(values: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds since the first sight, and values (t, R) by that clock; NaN where a run has ended."""
+    before, after = round(_BEFORE_S / scene.dt), round(_AFTER_S / scene.dt)
+    clock = np.arange(-before, after)
+    shifted = np.full((len(clock), values.shape[1]), np.nan)
+    for run, first in enumerate(scene.acquired.tolist()):
+        at = clock + first
+        inside = (at >= 0) & (at < len(values))
+        shifted[inside, run] = values[at[inside], run]
+    return clock * scene.dt, shifted
+
+
+def _new(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _errors(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
+    figure, axes = _new(1, 3, (13, 4))
+    parts = (("horizontal, m", slice(6, 8), 1.0), ("vertical, m", slice(8, 9), 1.0), ("tilt, deg", slice(0, 2), 57.3))
+    for name, result in results.items():
+        for axis, (title, part, unit) in zip(axes[0], parts, strict=True):
+            size = unit * np.linalg.norm(result["error"][..., part], axis=-1)
+            seconds, shifted = _since_sight(size, scene)
+            low, middle, high = np.nanquantile(shifted, [0.1, 0.5, 0.9], axis=1)
+            (line,) = axis.plot(seconds, middle, label=name)
+            axis.fill_between(seconds, low, high, color=line.get_color(), alpha=0.1, linewidth=0)
+            axis.set(title=title, yscale="log", xlabel="s since the beacon was first seen")
+    axes[0][0].legend(fontsize=7)
+    figure.suptitle("Errors at heading zero: median, 10 % to 90 % of the runs")
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def _paths(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
+    names = list(results)[:6]
+    figure, axes = _new(1, len(names), (3.4 * len(names), 3.6))
+    truth = scene.model.representative(scene.truth)[..., 7:10].numpy()
+    for axis, name in zip(axes[0], names, strict=True):
+        for run in range(min(6, truth.shape[1])):
+            first = int(scene.acquired[run])
+            axis.plot(*truth[:, run, :2].T, color="0.6", linewidth=2.5)
+            position = results[name]["position"][:, run, :2]
+            axis.plot(*position[:first].T, ":", color="C1", linewidth=0.8)
+            axis.plot(*position[first:].T, color="C0", linewidth=0.8)
+        axis.plot(0, 0, "k+")
+        axis.set(title=name, xlim=(-40, 40), ylim=(-40, 40), aspect="equal", xlabel="right, m")
+    axes[0][0].set_ylabel("forward, m")
+    figure.suptitle("Pad frame turned to heading zero: truth grey, estimate dotted before the beacon is seen")
+    figure.savefig(path, dpi=120)
+    return path
