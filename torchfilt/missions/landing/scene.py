@@ -31,7 +31,7 @@ _SAMPLES = IMU_RATE_HZ // FILTER_RATE_HZ
 BAROMETER_SD_M, BEACON_SD_RAD = 0.4, math.radians(0.4)
 # Purposes of random numbers, keys of the noise source.
 _START, _PATH, _IMU, _BAROMETER, _BEACON, _CHANCE = range(6)
-# A start is drawn again until the pad can be reached in time: about one in six is.
+# A start is drawn again until the pad can be reached in time: about one in five is.
 START_HEIGHT_M = 12.0
 _DRAWS, _FARTHEST_M, _HEIGHTS_M = 64, 35.0, (5.0, 20.0)
 # What is left of the height after so long at the first vertical speed must be enough too.
