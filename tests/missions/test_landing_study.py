@@ -1,0 +1,102 @@
+"""The landing study: a short run whole, its numbers, what is kept, what is refused; targets over 50 runs."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import run_landing
+import torch
+
+from torchfilt.missions.landing import study
+from torchfilt.missions.landing.scene import SCENARIOS, LandingSettings, make_scene
+
+SHORT = LandingSettings(runs=2, duration_s=18.0)
+
+
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("landing")
+    said = []
+    summary = study.run_landing(SHORT, folder, ("ukf-restart", "mekf-no-gauge"), say=said.append)
+    return folder, summary, said
+
+
+def test_a_short_run_lands(outcome):
+    folder, summary, said = outcome
+    entry = summary["filters"]["ukf-restart"]
+    assert entry["converged"] == 1.0 and entry["failed"] == 0 and entry["ms_one_vehicle"] > 0
+    assert json.loads((folder / "metrics.json").read_text()) == summary
+    assert any("mekf-no-gauge" in line for line in said)
+    assert {path.name for path in (folder / "figures").iterdir()} == {"errors.png", "paths.png"}
+
+
+def test_finished_stages_are_kept(outcome):
+    folder, summary, _ = outcome
+    said = []
+    again = study.run_landing(SHORT, folder, ("ukf-restart", "mekf-no-gauge"), say=said.append, figures=False)
+    assert sum("as before" in line for line in said) == 2
+    for name, entry in again["filters"].items():
+        del entry["ms_one_vehicle"]
+        assert entry.items() <= summary["filters"][name].items()
+
+
+def test_numbers_of_made_up_errors():
+    """Ten steps of 1 s: one run comes near at step 4 and stays, one never does; the beacon is seen at step 2."""
+    error = np.zeros((20, 2, 15))
+    error[:4, 0, 6], error[:, 1, 6], error[:, :, 8], error[:, :, 0] = 30.0, 40.0, 0.5, math.radians(3)
+    result = {
+        "error": error,
+        "nees": np.full((20, 2), 28.0),
+        "ok": np.ones((20, 2), bool),
+        "restarts": np.array([0.0, 2.0]),
+        "cpu_s": np.full(20, 0.25),
+    }
+    found = study.summarize(result, torch.tensor([2, 2]), 1.0)
+    assert found["converged"] == 0.5 and found["seconds_to_converge"] == 2.0
+    assert found["horizontal_m"] == [0.0, 40.0] and found["vertical_m"] == [0.5, 0.5]
+    np.testing.assert_allclose(found["attitude_deg"], [3.0, 3.0])
+    assert found["nees"] == 2.0 and found["restarts"] == 1 and found["failed"] == 0 and found["ms_per_step"] == 250.0
+
+
+def test_every_filter_can_be_made():
+    scene = make_scene(LandingSettings(runs=1, duration_s=11.0))
+    for name in study.FILTERS:
+        assert study.make_filter(name, scene).model is (scene.world_model if "no-gauge" in name else scene.model)
+    with pytest.raises(ValueError, match=r"filters must be out of .* got kalman"):
+        study.make_filter("kalman", scene)
+
+
+def test_the_command_line_knows_what_the_study_knows():
+    assert set(run_landing.FILTERS) == set(study.FILTERS)
+    assert set(run_landing.SCENARIOS) == set(SCENARIOS)
+
+
+def test_wrong_use_is_told(tmp_path, capsys):
+    assert run_landing.main(["--runs", "0", "--out", str(tmp_path / "a")]) == 2
+    assert "runs must be at least 1, got 0" in capsys.readouterr().err
+    assert run_landing.main(["--filters", "kalman", "--out", str(tmp_path / "a")]) == 2
+    assert "--filters takes" in capsys.readouterr().err
+
+
+# Targets --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ukf-restart", "llpf-50"])
+def test_the_nominal_landing(name):
+    """At least 0.99 converged, at most 0.07 m in the median, consistent."""
+    settings = LandingSettings()
+    scene = make_scene(settings)
+    found = study.summarize(study.run_filter(name, scene, 0), scene.acquired, scene.dt)
+    assert found["converged"] >= 0.99 and found["horizontal_m"][0] <= 0.07
+    assert 0.8 <= found["nees"] <= 1.5
+
+
+@pytest.mark.slow
+def test_a_false_source_is_left_again():
+    scene = make_scene(LandingSettings("false-source"))
+    stuck, again = (
+        study.summarize(study.run_filter(name, scene, 0), scene.acquired, scene.dt) for name in ("ukf", "ukf-restart")
+    )
+    assert again["converged"] >= 0.95 > stuck["converged"]
