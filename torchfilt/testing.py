@@ -18,17 +18,18 @@ from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import AdditiveGaussian, LinearGaussian, call_style
-from torchfilt.model import as_gaussian
+from torchfilt.model import StateSpaceModel, as_gaussian
 from torchfilt.moments import Rule, predict, update
 from torchfilt.particles import Particles, PastStep
 from torchfilt.resampling import Resampler
 from torchfilt.run import Filter
 from torchfilt.spaces import Angle, Space
+from torchfilt.symmetry import GaugedInitial, GaugedTransition, gauge_first_order, into_gauge
 from torchfilt.types import FilterError, FilterState, StepNoise
 
 Step = Tensor | float | None
 
-__all__ = ["check_filter", "check_law", "check_resampler", "check_rule", "check_space"]
+__all__ = ["check_filter", "check_law", "check_resampler", "check_rule", "check_space", "check_symmetry"]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -177,6 +178,86 @@ def _check_short_cuts(
         slack = tolerance * high + 1e-300
         inside = bool(((own >= low * 0.5 - slack) & (own <= high * 2 + slack)).all())
         _require(inside, f"{name}: pooled noise must be of the size of the noise at the points")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Symmetries
+
+
+def check_symmetry(
+    model: StateSpaceModel, x: Tensor, u: Tensor | None = None, dt: Step = None, *, tolerance: float = 1e-9
+) -> None:
+    """A model with a gauge: the laws do not notice that a state is replaced by the representative of its orbit.
+
+    The gauge is a projection, row by row; a measurement's law is the same at x and at its representative; the motions
+    from both, carried into the gauge, are the same law (noise across the orbit by the gauge's derivative); a
+    ``first_order`` of the gauge is its derivative.
+
+    Args:
+        model: made with ``gauge=``.
+        x: (rows, d) states, at least two rows, all apart from their representatives.
+        u: (rows, k), (k,) or None.
+        dt: number, (rows, 1) or None.
+        tolerance: relative to the largest entry, for every comparison; absolute for tangent vectors below one.
+
+    Raises:
+        AssertionError: a rule is broken.
+    """
+    gauge = model.gauge
+    _require(gauge is not None, "check_symmetry needs a model with a gauge: StateSpaceModel(..., gauge=...)")
+    assert gauge is not None
+    name = type(gauge).__name__ if isinstance(gauge, nn.Module) else getattr(gauge, "__name__", "gauge")
+    _require(x.dim() == 2 and len(x) >= 2, f"{name}: give x as (rows, d) with two rows or more, got {tuple(x.shape)}")
+    motion: Any = model.transition
+    law = motion.law if isinstance(motion, GaugedTransition) else motion
+    initial: Any = model.initial
+    space = as_gaussian(initial.law() if isinstance(initial, GaugedInitial) else initial()).space
+    with _untouched(name):
+        there = gauge(x)
+        _check_gauge(name, gauge, x, there, space, tolerance)
+        seen, as_seen = (as_gaussian(model.conditional("observation", at, u, dt)) for at in (x, there))
+        _close_laws(f"{name}: what is measured at a state and at its representative", as_seen, seen, tolerance)
+        moved, as_moved = (into_gauge(gauge, as_gaussian(_caller(law)(at, u, dt))) for at in (x, there))
+        _close_laws(
+            f"{name}: the motions of a state and of its representative, in the gauge", as_moved, moved, tolerance
+        )
+        if hasattr(gauge, "first_order"):
+            at, jacobian = gauge.first_order(x)
+            _near(f"{name}: the representative of first_order", at, there, tolerance * _size(there))
+            _, expected = gauge_first_order(lambda points: gauge(points), x, space)
+            label = f"{name}: first_order and the derivative of the map"
+            _near(label, jacobian, expected, tolerance * _size(expected))
+
+
+def _check_gauge(
+    name: str, gauge: Callable[[Tensor], Tensor], x: Tensor, there: Tensor, space: Space, tolerance: float
+) -> None:
+    """Shapes, dtype, a projection onto the space, batch = loop, neighbours."""
+    _require(there.shape == x.shape, f"{name}: a representative must be {tuple(x.shape)}, got {tuple(there.shape)}")
+    for single, found in ((x, there), (x.float(), gauge(x.float()))):
+        _require(
+            found.dtype == single.dtype, f"{name}: the gauge must keep the dtype {single.dtype}, got {found.dtype}"
+        )
+    _require(bool(torch.isfinite(there).all()), f"{name}: representatives must be finite")
+    limit = tolerance * _size(there)
+    away = (space.project(there) - there).abs().max().item()
+    _require(away <= limit, f"{name}: a representative must lie on {space!r}, it is {away:.3g} off")
+    apart = space.local(x, there).abs().amax(-1)
+    _require(
+        bool((apart > limit).all()), f"{name}: give states that are not representatives, row {int(apart.argmin())} is"
+    )
+    away = _distance(space, gauge(there), there)
+    _require(away <= limit, f"{name}: the representative of a representative is itself, it is {away:.3g} off")
+    for k in range(len(x)):
+        away = _distance(space, gauge(x[k]), there[k])
+        _require(away <= limit, f"{name}: row {k} alone and in the batch differ by {away:.3g}")
+    beside = gauge(torch.cat([x[:1] * torch.nan, x[1:]]))
+    _same(f"{name}: rows beside a row that holds NaN", beside[1:], there[1:])
+
+
+def _size(values: Tensor) -> float:
+    """The largest entry, at least one."""
+    return max(1.0, values.abs().max().item())
 
 
 # ----------------------------------------------------------------------------------------------------------------------
