@@ -9,6 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchfilt.models import attitude
+from torchfilt.models.attitude import rotations
 from torchfilt.spaces import UnitQuaternion
 
 DOUBLE = torch.float64
@@ -165,7 +166,7 @@ FUNCTIONS = {
 
 
 def test_every_function_is_in_the_table():
-    own = {n: f for n, f in vars(attitude).items() if getattr(f, "__module__", "") == attitude.__name__}
+    own = {n: f for n, f in vars(rotations).items() if getattr(f, "__module__", "") == rotations.__name__}
     public = {n for n in own if not n.startswith("_")}
     assert public == set(FUNCTIONS)
 

@@ -17,19 +17,33 @@ from torchfilt.models.attitude.rotations import (
     to_matrix,
     to_rotation_vector,
 )
+from torchfilt.models.attitude.wahba import (
+    WahbaSolution,
+    attitude_covariance,
+    davenport_q,
+    initial_attitude,
+    quest,
+    triad,
+    wahba_svd,
+)
 
 __all__ = [
     "ATTITUDE_SPACE",
     "GyroTransition",
     "VectorMeasurement",
+    "WahbaSolution",
+    "attitude_covariance",
+    "davenport_q",
     "from_euler",
     "from_matrix",
     "from_rotation_vector",
+    "initial_attitude",
     "inverse",
     "mean_rotation",
     "multiply",
     "ned_frd_to_enu_rfu",
     "plausible",
+    "quest",
     "rotate",
     "skew",
     "swap_enu_ned",
@@ -37,4 +51,6 @@ __all__ = [
     "to_euler",
     "to_matrix",
     "to_rotation_vector",
+    "triad",
+    "wahba_svd",
 ]
