@@ -6,6 +6,7 @@ A new law, rule, filter, resampler or space is one line in a registry below.
 import inspect
 
 import pytest
+import symmetry_problem
 import torch
 from torch import nn
 
@@ -14,7 +15,7 @@ from torchfilt import moments, resampling
 from torchfilt.gp import GPTransition
 from torchfilt.gp.regression import GPRegression
 from torchfilt.kernels import Regularize
-from torchfilt.models import relative_motion
+from torchfilt.models import landing, relative_motion
 from torchfilt.models.inertial import error_model, navigation
 from torchfilt.models.inertial.earth import LocalMetres
 from torchfilt.models.inertial.error_model import InertialErrorFixes, InertialErrorTransition
@@ -38,7 +39,7 @@ from torchfilt.models.relative_motion import (
 from torchfilt.moves import MetropolisHastings
 from torchfilt.resampling import Resampler, ess_below, kld_adaptive
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
-from torchfilt.testing import check_filter, check_law, check_resampler, check_rule, check_space
+from torchfilt.testing import check_filter, check_law, check_resampler, check_rule, check_space, check_symmetry
 
 DOUBLE = torch.float64
 
@@ -176,6 +177,33 @@ LAWS = {
         INCREMENTS,
         0.2,
     ),
+    "Sensors": (
+        tf.Sensors(
+            level=tf.LinearGaussian(normal(1, 2, seed=16), spd(1)),
+            compass=tf.AdditiveGaussian(lambda x: x.sin(), spd(2), Angle(2)),
+            bound=tf.PseudoMeasurement(lambda x: x[..., :1] - x[..., 1:].cos(), 1, 0.2),
+        ),
+        X2,
+        None,
+        None,
+    ),
+    "Sensors linear": (
+        tf.Sensors(
+            level=tf.LinearGaussian(normal(1, 2, seed=16), spd(1), control_matrix=normal(1, 2, seed=17)),
+            bound=tf.PseudoMeasurement(normal(1, 2, seed=18), 1, 0.2, 1.0),
+        ),
+        X2,
+        normal(5, 2, seed=6),
+        None,
+    ),
+    "PseudoMeasurement": (
+        tf.PseudoMeasurement(
+            lambda x: x.sin(), 2, torch.tensor([0.1, 0.0], dtype=DOUBLE), jacobian=lambda x: torch.diag_embed(x.cos())
+        ),
+        X2,
+        None,
+        None,
+    ),
     "GPTransition identity": (learned(), NEAR, None, None),
     "GPTransition next state": (learned("next_state", noise="latent"), NEAR, None, 10.0),
     "GPTransition residual": (learned("residual", ClohessyWiltshire(1.1e-3, 1e-9)), NEAR, None, 10.0),
@@ -202,7 +230,7 @@ def test_every_law_is_registered():
     laws = {type(law).__name__ for law, *_ in LAWS.values()}
     shipped = {
         name
-        for module in (tf.laws, relative_motion, error_model, navigation, tf.gp)
+        for module in (tf.laws, tf.sensors, relative_motion, error_model, navigation, tf.gp)
         for name, member in inspect.getmembers(module, inspect.isclass)
         if issubclass(member, nn.Module)
         and inspect.signature(member.forward).return_annotation in (tf.Gaussian, "Gaussian")
@@ -382,6 +410,76 @@ def test_particle_filters_with_controls_and_time_steps(name):
     dt = torch.tensor([0.1, 0.0, 0.2, 0.1, 0.3, 0.1], dtype=DOUBLE)
     check_filter(PARTICLE[name](SWINGING), ys, normal(6, 2), dt)
     check_filter(PARTICLE[name](SWINGING), ys, normal(6, 3, 2), dt.unsqueeze(-1) * torch.tensor([1.0, 0.5, 2.0]))
+
+
+# Sensors, a constraint, gates and a symmetry; 0.999 lets some of these made-up measurements pass and some not.
+SENSORS = tf.StateSpaceModel(
+    SWINGING.initial,
+    SWINGING.transition,
+    tf.Sensors(
+        swing=tf.AdditiveGaussian(lambda x: x[..., :1], 0.3 * spd(1), Angle(1)),
+        rate=tf.LinearGaussian(torch.tensor([[0.1, 1.0]], dtype=DOUBLE), 0.3 * spd(1, seed=1)),
+        energy=tf.PseudoMeasurement(lambda x: x[..., 1:].square() / 2 - x[..., :1].cos(), 1, 0.5, -0.5),
+    ),
+)
+GATE = tf.robust.Gate(0.9, outlier_log_density={"swing": -2.0}, sensors=("swing", "rate"))
+GUARDED = {
+    "UnscentedKalmanFilter gated": lambda m: tf.UnscentedKalmanFilter(m, gate=GATE),
+    "LLPF gated": lambda m: tf.LocallyLinearizedParticleFilter(m, 20, gate=GATE),
+    "Reacquire": lambda m: tf.robust.Reacquire(tf.UnscentedKalmanFilter(m, gate=GATE), "swing", 0.15),
+    "Reacquire LLPF": lambda m: tf.robust.Reacquire(
+        tf.LocallyLinearizedParticleFilter(m, 20, gate=GATE), "swing", 0.15
+    ),
+}
+SEEN = {name: GAUSSIAN[name] for name in ("ExtendedKalmanFilter", "UnscentedKalmanFilter iterated")}
+SEEN |= {name: PARTICLE[name] for name in ("Bootstrap moved", "Regularized", "UPF pooled", "LLPF", "RBPF first drawn")}
+
+
+@pytest.mark.parametrize("name", SEEN | GUARDED)
+def test_filters_of_sensors(name):
+    """With dt, by which patience is counted."""
+    ys = SENSORS.observation.complete(torch.cat([normal(6, 3, 2, seed=9), torch.full((6, 3, 1), torch.nan)], -1))
+    check_filter((SEEN | GUARDED)[name](SENSORS), ys, None, 0.1)
+
+
+TURNED = ("ExtendedKalmanFilter", "UnscentedKalmanFilter", "Bootstrap adaptive stratified", "Regularized", "LLPF")
+
+
+@pytest.mark.parametrize("name", TURNED)
+@pytest.mark.parametrize("own", [True, False], ids=["derivative of its own", "plain"])
+def test_filters_in_a_gauge(name, own):
+    sensors = tf.Sensors(camera=symmetry_problem.camera(0.3), range=symmetry_problem.ranging(1.0))
+    gauge = symmetry_problem.NoseEast() if own else symmetry_problem.nose_east
+    model = symmetry_problem.model(gauge, sensors, symmetry_problem.Drive(0.1))
+    ys = torch.cat([normal(6, 3, 2, seed=9, scale=0.4), 11 + normal(6, 3, 1, seed=10)], -1)
+    check_filter((GAUSSIAN | PARTICLE)[name](model), ys, torch.tensor(symmetry_problem.US[:6]), symmetry_problem.DT)
+
+
+PLANE = torch.tensor([[1.0, 2.0, 0.5], [-3.0, 1.0, -2.5], [0.3, -4.0, 3.0]], dtype=DOUBLE)
+HOVER = normal(4, 16, seed=20) * torch.tensor([0.3] * 3 + [1.0] + [2.0] * 6 + [0.01] * 6, dtype=DOUBLE)
+HOVER = torch.cat(
+    [torch.nn.functional.normalize(HOVER[:, :4], dim=-1), HOVER[:, 4:9], HOVER[:, 9:10].abs() + 8, HOVER[:, 10:]], -1
+)
+SYMMETRIES = {
+    "plane": (
+        symmetry_problem.model(symmetry_problem.NoseEast(), symmetry_problem.camera(0.1)),
+        PLANE,
+        normal(3, 2, seed=19),
+        0.5,
+    ),
+    "landing": (landing.landing_model(), HOVER, normal(4, 6, seed=21, scale=0.1), 0.025),
+    "landing, unknown pad height": (
+        landing.landing_model(landing.LandingStart(pad_height_sd_m=5.0)),
+        torch.cat([HOVER, normal(4, 1, seed=22)], -1),
+        normal(6, seed=21, scale=0.1),
+        0.025,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SYMMETRIES)
+def test_symmetries(name):
+    check_symmetry(*SYMMETRIES[name])
 
 
 @pytest.mark.parametrize("name", ["unscented", "particle"])

@@ -25,7 +25,7 @@ from torchfilt.resampling import Resampler
 from torchfilt.run import Filter
 from torchfilt.spaces import Angle, Space
 from torchfilt.symmetry import GaugedInitial, GaugedTransition, gauge_first_order, into_gauge
-from torchfilt.types import FilterError, FilterState, StepNoise
+from torchfilt.types import FilterError, FilterState, Guarded, StepNoise
 
 Step = Tensor | float | None
 
@@ -578,6 +578,8 @@ def _check_rows(name: str, run: _Run, tolerance: float) -> None:
 
 
 def _belief_row(belief: Any, k: int) -> Any:
+    if isinstance(belief, Guarded):
+        return Guarded(_belief_row(belief.belief, k), _belief_row(belief.fallback, k), belief.refused_s[k : k + 1])
     if isinstance(belief, Gaussian):
         return _pick(belief, slice(k, k + 1))
     factor = belief.scale_tril
@@ -600,6 +602,7 @@ def _noise_row(noise: StepNoise, k: int) -> StepNoise:
         move_normal=None if noise.move_normal is None else noise.move_normal[:, :, k : k + 1],
         move_uniform=None if noise.move_uniform is None else noise.move_uniform[:, k : k + 1],
         kernel=first(noise.kernel),
+        restart=None if noise.restart is None else noise.restart[:, k : k + 1],
     )
 
 
@@ -628,6 +631,8 @@ def _check_failure(name: str, run: _Run, tolerance: float) -> None:
 
 
 def _lost(belief: Any) -> Any:
+    if isinstance(belief, Guarded):
+        return belief._replace(belief=_lost(belief.belief))
     sick = torch.zeros(len(belief.mean), *[1] * (1 if isinstance(belief, Gaussian) else 2), dtype=belief.mean.dtype)
     sick[0] = torch.nan
     if isinstance(belief, Gaussian):
