@@ -70,7 +70,7 @@ def test_a_measurement_is_the_parts_side_by_side():
     expected = scipy.linalg.block_diag(*(part.factor().detach().numpy() for part in parts))
     np.testing.assert_array_equal(law.scale_tril.detach(), expected)
     assert law.scale_tril.dim() == 2, "nothing of it belongs to a row"
-    assert law.space == tf.Product(tf.Euclidean(2), tf.Product(tf.Euclidean(1), tf.Angle(1)), tf.Euclidean(1))
+    assert law.space == tf.Product(tf.Euclidean(3), tf.Angle(1), tf.Euclidean(1))
     assert (sensors.names, sensors.sizes, sensors.size, sensors.tangent_size) == (
         ("speed", "camera", "height"),
         (2, 2, 1),

@@ -1,6 +1,6 @@
 """Sensors that come and go, and constraints: several measurement laws side by side, NaN where one is silent."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -209,7 +209,7 @@ class Sensors(nn.Module):
         mean = _side_by_side([part.mean for part in found])
         space = self.space
         if not all(_same(part.space, stated) for part, stated in zip(found, self._spaces, strict=True)):
-            space = _joint(tuple(_sized(part.space, size) for part, size in zip(found, self.sizes, strict=True)))
+            space = _joint(_sized(part.space, size) for part, size in zip(found, self.sizes, strict=True))
         if all(part.is_diagonal for part in found):
             return Gaussian(mean, _side_by_side([part.scale_tril for part in found]), space, True)
         return Gaussian(mean, _block_diagonal([part.factor() for part in found]), space)
@@ -404,11 +404,15 @@ def _same(space: Space, stated: Space) -> bool:
     return space == stated or type(space) is type(stated) is Euclidean
 
 
-def _joint(spaces: tuple[Space, ...]) -> Space:
-    """Euclidean as long as all are."""
-    if all(isinstance(space, Euclidean) for space in spaces):
-        return Euclidean(sum(space.size or 0 for space in spaces))
-    return Product(*spaces)
+def _joint(spaces: Iterable[Space]) -> Space:
+    """Side by side, products laid open and Euclidean neighbours merged: each part left is one more operation."""
+    flat: list[Space] = []
+    for space in spaces:
+        for part in space.spaces if isinstance(space, Product) else (space,):
+            if flat and isinstance(part, Euclidean) and isinstance(flat[-1], Euclidean):
+                part = Euclidean((flat.pop().size or 0) + (part.size or 0))
+            flat.append(part)
+    return flat[0] if len(flat) == 1 else Product(*flat)
 
 
 def _slices(sizes: Any) -> tuple[slice, ...]:
