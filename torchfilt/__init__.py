@@ -1,6 +1,6 @@
 """Probabilistic filtering in PyTorch: one state-space model, any filter, gradients through everything."""
 
-from torchfilt import kernels, moments, moves, proposals, rao_blackwell, resampling, spaces
+from torchfilt import kernels, mixture, moments, moves, proposals, rao_blackwell, resampling, spaces
 from torchfilt.filters import (
     AuxiliaryParticleFilter,
     BootstrapFilter,
@@ -9,6 +9,8 @@ from torchfilt.filters import (
     ExtendedKalmanFilter,
     GaussHermiteKalmanFilter,
     GaussianFilter,
+    GaussianSumFilter,
+    InteractingMultipleModel,
     KalmanFilter,
     LocallyLinearizedParticleFilter,
     ParticleFilter,
@@ -23,6 +25,7 @@ from torchfilt.gaussian import Gaussian
 from torchfilt.history import History
 from torchfilt.laws import AdditiveGaussian, LinearGaussian
 from torchfilt.lazy import lazy_names
+from torchfilt.mixture import InitialMixture, MixtureLaw, split_gaussian
 from torchfilt.model import StateSpaceModel
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
@@ -54,10 +57,14 @@ __all__ = [
     "GaussHermiteKalmanFilter",
     "Gaussian",
     "GaussianFilter",
+    "GaussianSumFilter",
     "History",
+    "InitialMixture",
+    "InteractingMultipleModel",
     "KalmanFilter",
     "LinearGaussian",
     "LocallyLinearizedParticleFilter",
+    "MixtureLaw",
     "NoiseSource",
     "ParticleFilter",
     "Particles",
@@ -81,12 +88,14 @@ __all__ = [
     "metrics",
     "missions",
     "models",
+    "mixture",
     "moments",
     "moves",
     "proposals",
     "rao_blackwell",
     "resampling",
     "spaces",
+    "split_gaussian",
     "testing",
 ]
 

@@ -9,6 +9,7 @@ from torchfilt.filters.gaussian import (
     KalmanFilter,
     UnscentedKalmanFilter,
 )
+from torchfilt.filters.mixture import GaussianSumFilter, InteractingMultipleModel
 from torchfilt.filters.particle import ParticleFilter
 from torchfilt.filters.particle_methods import (
     AuxiliaryParticleFilter,
@@ -28,6 +29,8 @@ __all__ = [
     "ExtendedKalmanFilter",
     "GaussHermiteKalmanFilter",
     "GaussianFilter",
+    "GaussianSumFilter",
+    "InteractingMultipleModel",
     "KalmanFilter",
     "LocallyLinearizedParticleFilter",
     "ParticleFilter",
