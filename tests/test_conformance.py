@@ -16,6 +16,7 @@ from torchfilt.gp import GPTransition
 from torchfilt.gp.regression import GPRegression
 from torchfilt.kernels import Regularize
 from torchfilt.models import landing, relative_motion
+from torchfilt.models.attitude import ATTITUDE_SPACE, GyroTransition, VectorMeasurement
 from torchfilt.models.inertial import error_model, navigation
 from torchfilt.models.inertial.earth import LocalMetres
 from torchfilt.models.inertial.error_model import InertialErrorFixes, InertialErrorTransition
@@ -74,6 +75,9 @@ SINS = error_model.sins_inputs(
 STATES = navigation.NAVIGATION_SPACE.retract(
     navigation.navigation_state(Navigation(*(part[0] for part in FLOWN.navigation)), ORIGIN),
     normal(5, 15, seed=15) * torch.tensor([0.1, 1.0, 100.0, 1e-3, 1e-2], dtype=DOUBLE).repeat_interleave(3),
+)
+ATTITUDES = ATTITUDE_SPACE.retract(
+    torch.tensor([0.5, -0.5, 0.5, 0.5, 0.01, 0.0, -0.01], dtype=DOUBLE), normal(5, 6, seed=22)
 )
 INCREMENTS = torch.cat(increments(FLOWN.dtheta_rad / 0.01, FLOWN.dvelocity_m_s / 0.01, 0.01, 20), -1)
 IMU_WALKS = dict(
@@ -162,6 +166,15 @@ LAWS = {
         INCREMENTS[0],
         torch.tensor([[0.1], [0.0], [2.0], [0.5], [0.1]], dtype=DOUBLE),
     ),
+    "GyroTransition": (GyroTransition(1e-3, 1e-5), ATTITUDES, normal(3, seed=23), 0.1),
+    "GyroTransition dt a row": (
+        GyroTransition(1e-3, 1e-5, gyro_bias_time_s=20.0),
+        ATTITUDES,
+        normal(5, 3, seed=23),
+        torch.tensor([[0.1], [0.2], [0.0], [1.0], [0.5]], dtype=DOUBLE),
+    ),
+    "VectorMeasurement": (VectorMeasurement(normal(3, seed=24), 0.2), ATTITUDES, None, None),
+    "VectorMeasurement of a navigation state": (VectorMeasurement(normal(3, seed=24), 0.2), STATES, None, None),
     "NavigationFixes": (NavigationFixes(position_sd_m=2.0, heading_sd_rad=0.1), STATES, None, None),
     "NavigationFixes all, with arms": (
         NavigationFixes(
