@@ -109,7 +109,11 @@ def test_it_compiles_whole(make):
         (lambda: tf.Reacquire(model(), "fine"), TypeError, "must be a GaussianFilter or a ParticleFilter"),
         (lambda: tf.Reacquire(tf.GaussianFilter(model(), taylor()), "fine"), ValueError, "give it gate="),
         (lambda: tf.Reacquire(INNER["gaussian"](), "coarse"), ValueError, "that the gate tests, got 'coarse'"),
-        (lambda: tf.Reacquire(INNER["gaussian"](), "other"), ValueError, "one of coarse, fine that the gate tests, got 'other'"),
+        (
+            lambda: tf.Reacquire(INNER["gaussian"](), "other"),
+            ValueError,
+            "one of coarse, fine that the gate tests, got 'other'",
+        ),
         (lambda: tf.Reacquire(INNER["gaussian"](), "fine", 0.0), ValueError, "patience_s must be positive"),
         (lambda: tf.Reacquire(INNER["gaussian"](), "fine", rule="taylor"), TypeError, "rule must be a moment rule"),
         (lambda: tf.Reacquire(INNER["gaussian"](), "fine")(series()), ValueError, "the step needs its dt"),

@@ -124,7 +124,12 @@ def navigate(x, p, samples, densities, measurements, deviation, origin, arm):
             gain = np.linalg.solve(h @ p @ h.T + r, h @ p).T
             keep = np.eye(15) - gain @ h
             p = keep @ p @ keep.T + gain @ r @ gain.T
-            x = retract(x, gain @ (y - cloud[0])[seen])
+            before, shift = x, gain @ (y - cloud[0])[seen]
+            x = retract(before, shift)
+            # The reset: errors about the state before, seen from the state after.
+            ends = [retract(before, shift + step) for step in (0 * _STEPS, *np.diag(_STEPS), *-np.diag(_STEPS))]
+            reset = _split(np.stack([local(x, end) for end in ends]))
+            p = reset @ p @ reset.T
         out.append((x, p))
     return out
 
