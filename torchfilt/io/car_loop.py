@@ -4,26 +4,23 @@ Units (degrees), axes (sensor forward-left-up, velocity and deviations north-eas
 writes before it knows (zero) end here.
 """
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilt.io.files import LogError, read_digests, read_packed_text
+from torchfilt.io.files import LogError, read_digests
 from torchfilt.io.inertial import (
     Gaps,
     GnssFixes,
     InertialLog,
     Reference,
-    check_finite,
     check_fixes,
     check_samples,
     check_times,
 )
+from torchfilt.io.tables import Table, read_table
 
 FILES = ("imu.csv.gz", "gnss.csv.gz", "reference_position.csv.gz", "reference_attitude.csv.gz")
 # Until then the receiver's own solution has not settled.
@@ -37,12 +34,6 @@ _POSITION = "t_s,lat_deg,lon_deg,height_m,vn_mps,ve_mps,vd_mps,heading_rad"
 _ATTITUDE = "t_s,roll_deg,pitch_deg,yaw_deg"
 # The four files were cut to one span; the slowest of them has a row each half second.
 _END_TOLERANCE_S = 1.0
-
-
-class _Table(NamedTuple):
-    name: str
-    time_s: Tensor
-    values: Tensor
 
 
 def read_car_loop(
@@ -71,7 +62,7 @@ def read_car_loop(
     folder, digests = Path(folder), read_digests(manifest)
     columns = (_IMU, _GNSS, _POSITION, _ATTITUDE)
     imu, gnss, position, attitude = (
-        _read_table(folder / name, header, digests) for name, header in zip(FILES, columns, strict=True)
+        read_table(folder / name, header, digests) for name, header in zip(FILES, columns, strict=True)
     )
     gyro, accel = (_rfu(values) for values in imu.values.split(3, dim=-1))
     marked = check_samples(imu.name, imu.time_s, gyro, accel, max_gap_s, gaps)
@@ -87,7 +78,7 @@ def read_car_loop(
     return InertialLog(imu.time_s, gyro, accel, fixes, reference, marked)
 
 
-def _fixes(table: _Table) -> GnssFixes:
+def _fixes(table: Table) -> GnssFixes:
     latitude, longitude, height = _geodetic(table)
     position_sd, velocity_sd = (values[:, [1, 0, 2]] for values in table.values[:, 6:12].split(3, dim=-1))
     heading = _once_known(table.values[:, 12])
@@ -98,7 +89,7 @@ def _fixes(table: _Table) -> GnssFixes:
     return fixes
 
 
-def _reference(position: _Table, attitude: _Table) -> Reference:
+def _reference(position: Table, attitude: Table) -> Reference:
     for table in (position, attitude):
         check_times(table.name, table.time_s)
     if not torch.equal(position.time_s, attitude.time_s):
@@ -114,7 +105,7 @@ def _reference(position: _Table, attitude: _Table) -> Reference:
     return Reference(position.time_s, heading, pitch, roll, latitude, longitude, height, velocity)
 
 
-def _geodetic(table: _Table) -> tuple[Tensor, Tensor, Tensor]:
+def _geodetic(table: Table) -> tuple[Tensor, Tensor, Tensor]:
     return table.values[:, 0].deg2rad(), table.values[:, 1].deg2rad(), table.values[:, 2]
 
 
@@ -135,43 +126,3 @@ def _once_known(values: Tensor) -> Tensor:
 
 def _wrapped(angle: Tensor) -> Tensor:
     return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
-
-
-def _read_table(path: Path, header: str, digests: Mapping[str, str] | None) -> _Table:
-    text = read_packed_text(path, digests)
-    if not text.endswith("\n"):
-        raise LogError(f"{path.name}: row {text.count(chr(10))}: no line end; the file is cut short")
-    first, *lines = text.replace("\r\n", "\n").split("\n")[:-1]
-    if first != header:
-        absent = [name for name in header.split(",") if name not in first.split(",")]
-        told = f"without the columns {', '.join(absent)}" if absent else "with columns in another order or beside them"
-        raise LogError(f"{path.name}: header is {first[:80]!r}, {told}; expected {header!r}")
-    columns = header.count(",") + 1
-    try:
-        # Empty lines would be passed over in silence, no lines with a warning.
-        if not lines or "" in lines:
-            raise ValueError("no row or an empty one")
-        values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
-        if values.shape != (len(lines), columns):
-            raise ValueError(f"shape {values.shape}")
-    except ValueError as error:
-        raise LogError(f"{path.name}: {_first_fault(lines, columns) or error}") from error
-    table = torch.from_numpy(values)
-    check_finite(path.name, "this row", table)
-    return _Table(path.name, table[:, 0].contiguous(), table[:, 1:])
-
-
-def _first_fault(lines: list[str], columns: int) -> str:
-    """Row and rule of the first line that is no row of numbers."""
-    if not lines:
-        return "no rows"
-    for k, line in enumerate(lines, start=1):
-        fields = line.split(",")
-        if len(fields) != columns:
-            return f"row {k}: {len(fields)} columns, expected {columns}"
-        for field in fields:
-            try:
-                math.isfinite(float(field))
-            except ValueError as error:
-                return f"row {k}: {error}"
-    return ""
