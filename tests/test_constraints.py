@@ -147,13 +147,6 @@ def test_an_exact_constraint_that_holds_already_changes_nothing(name):
         np.testing.assert_allclose(found, expected.log_likelihood, rtol=1e-9)
 
 
-ITERATED = (
-    "moments.update takes the law's Jacobian out of the posterior's factor, which an exact constraint makes singular. "
-    "Wanted, for taylor(): columns of the prior's factor carried to the posterior's mean, without a division"
-)
-
-
-@pytest.mark.xfail(strict=True, reason=ITERATED)
 @pytest.mark.parametrize("kind", ["matrix", "function"])
 def test_iterations_go_with_an_exact_constraint(kind):
     """On linear laws a second linearisation changes nothing."""

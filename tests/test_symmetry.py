@@ -183,13 +183,6 @@ def test_a_bank_without_the_gauge_loses_evidence():
     assert np.log(ratio).mean() < -0.3 and spread > 1.1
 
 
-POOLED = (
-    "proposals.Local._pool matches draws by whole found^-1: in a direction without any spread, such as the orbit in a "
-    "gauge or that of an exact constraint, it divides by zero. Wanted: such directions keep what they have, zero"
-)
-
-
-@pytest.mark.xfail(strict=True, reason=POOLED)
 def test_a_pooled_redraw_leaves_the_orbit_alone():
     ratio, away, _ = against_exact(lambda m: tf.UnscentedParticleFilter(m, 30), nose_east)
     assert np.isfinite(ratio).all() and np.sqrt((away**2).mean()) < 0.3

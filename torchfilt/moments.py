@@ -412,18 +412,28 @@ def update(
         observed = decision.kept
     result = _condition(prior, line, None, y, observed)
     for _ in range(iterations - 1):
-        posterior = result.belief
-        line = rule.linearize(law, posterior, u, dt)
-        # slope S_posterior^-1 is the law's Jacobian; carry it back to the prior's own factor and mean.
-        jacobian = torch.linalg.solve_triangular(posterior.factor(), line.slope, upper=False, left=False)
-        away = posterior.space.local(posterior.mean, prior.mean)
-        line = line._replace(slope=jacobian @ prior.space.carry(-away, prior.factor()))
-        back = apply_factor(jacobian, away)
+        line, back = _again(law, prior, result.belief, rule, u, dt)
         result = _condition(prior, line, back, y, observed)
     if decision is None:
         return result
     log_likelihood = result.log_likelihood + decision.log_density
     return result._replace(log_likelihood=log_likelihood, accepted=decision.accepted, gate_nis=decision.nis)
+
+
+def _again(
+    law: Law, prior: Gaussian, posterior: Gaussian, rule: Rule, u: Tensor | None, dt: Tensor | float | None
+) -> tuple[Linearization, Tensor]:
+    """Linearised about the posterior, by the prior's whitened error; and what that says of the prior's own mean."""
+    space = prior.space
+    away = space.local(posterior.mean, prior.mean)
+    columns = space.carry(-away, prior.factor())
+    if isinstance(rule, Taylor):  # a derivative, which takes any columns: the way back is one more
+        line = rule.linearize(law, posterior._replace(scale_tril=cat_columns(columns, away.unsqueeze(-1))), u, dt)
+        return line._replace(slope=line.slope[..., :-1]), line.slope[..., -1]
+    line = rule.linearize(law, posterior, u, dt)
+    # slope S_posterior^-1 is the law's Jacobian; carry it back to the prior's own factor and mean.
+    jacobian = torch.linalg.solve_triangular(posterior.factor(), line.slope, upper=False, left=False)
+    return line._replace(slope=jacobian @ columns), apply_factor(jacobian, away)
 
 
 def _innovation(line: Linearization, y: Tensor, observed: Tensor | None) -> Tensor:

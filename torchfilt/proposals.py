@@ -272,6 +272,9 @@ class Local:
         drawn = apart + apply_factor(factor, noise)
         drawn = drawn - weighted_sum(drawn, weights).unsqueeze(-2)
         found = steady_triangularize((drawn * root).mT)
+        # Directions without any spread, such as an orbit in its gauge, keep what they have: nothing.
+        flat = found.diagonal(dim1=-2, dim2=-1) <= 64 * torch.finfo(found.dtype).eps * found.norm(dim=-1)
+        found = found + torch.diag_embed(flat.to(found.dtype))
         # whole found^-1 takes the draws' covariance to the cloud's.
         matched = whole @ torch.linalg.solve_triangular(found, drawn.mT, upper=False)
         away = ((1 - self.split) ** 0.5 * matched).mT
