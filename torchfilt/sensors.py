@@ -22,9 +22,9 @@ class PseudoMeasurement(nn.Module):
 
     Soft where sd > 0. Exact where sd = 0: for Gaussian filters and for particles that carry covariances; a point meets
     an exact constraint with probability zero, so that filters of points fail on it. Each use counts as information: a
-    soft constraint that is applied at each step is a measurement with independent errors at each step. An exact one that
-    holds already, because nothing has moved the state off it since the last time, divides zero by zero: leave it out of
-    such steps (None), or give it a small width.
+    soft constraint that is applied at each step is a measurement with independent errors at each step. An exact one
+    that holds already, because nothing has moved the state off it since the last time, divides zero by zero: leave it
+    out of such steps (None), or give it a small width.
 
     A part of `Sensors`, whose `Sensors.pack` and `Sensors.complete` write ``value`` into the measurement.
 
