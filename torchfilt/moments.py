@@ -119,8 +119,8 @@ class Quadrature(NamedTuple):
     """Nodes (s, e) for a standard normal with weights (s,) of the mean and of the covariance.
 
     ``paired``: nodes are [+c I, -c I], or these after a centre, so slope and residual split without a matrix product;
-    ``central`` is then the centre's covariance weight and ``negative`` says whether its mean weight is below zero, both
-    as plain values, so that a compiled step does not branch on tensors.
+    ``central`` is then the centre's covariance weight, ``negative`` whether its mean weight is below zero, ``reach`` is c,
+    all as plain values, so that a compiled step does not branch on tensors.
     """
 
     nodes: Tensor
@@ -129,6 +129,7 @@ class Quadrature(NamedTuple):
     paired: bool
     central: float = 0.0
     negative: bool = False
+    reach: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ class SigmaPoints:
     def linearize(self, law: Law, belief: Gaussian, u: Tensor | None, dt: Tensor | float | None) -> Linearization:
         """One batched evaluation of the law at all nodes."""
         rule = _quadrature(self.build, belief.tangent_size, belief.mean.dtype, belief.mean.device)
-        offsets = rule.nodes @ belief.factor().mT
+        offsets = _offsets(rule, belief.factor())
         points = belief.space.retract(belief.mean.unsqueeze(-2), offsets)
         at_points, noise = _evaluate(law, points, rule, lift(u), lift(dt))
         space = at_points.space
@@ -160,6 +161,15 @@ class SigmaPoints:
         split = _split_paired if rule.paired else _split
         slope, residual, negative = split(rule, deviation)
         return Linearization(mean, slope, residual, noise, space, negative)
+
+
+def _offsets(rule: Quadrature, factor: Tensor) -> Tensor:
+    """Errors (..., s, e) of the nodes; of paired ones without a product, which would be mostly zeros."""
+    if not rule.paired:
+        return rule.nodes @ factor.mT
+    columns = rule.reach * factor.mT
+    centre = [torch.zeros_like(columns[..., :1, :])] * (len(rule.nodes) - 2 * columns.shape[-1])
+    return torch.cat([*centre, columns, -columns], -2)
 
 
 def _split_paired(rule: Quadrature, deviation: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -272,7 +282,7 @@ def unscented(alpha: float = 1.0, beta: float = 0.0, kappa: float | None = None)
         mean_weights = torch.cat([torch.tensor([central], dtype=torch.float64), side])
         central_spread = central + 1 - alpha**2 + beta
         spread = torch.cat([torch.tensor([central_spread], dtype=torch.float64), side])
-        return Quadrature(nodes, mean_weights, spread, True, central_spread, central < 0)
+        return Quadrature(nodes, mean_weights, spread, True, central_spread, central < 0, reach**0.5)
 
     return SigmaPoints("unscented", build, (unscented, (alpha, beta, kappa)))
 
@@ -284,7 +294,7 @@ def cubature() -> SigmaPoints:
     def build(size: int) -> Quadrature:
         eye = torch.eye(size, dtype=torch.float64) * size**0.5
         weights = torch.full((2 * size,), 0.5 / size, dtype=torch.float64)
-        return Quadrature(torch.cat([eye, -eye]), weights, weights, True)
+        return Quadrature(torch.cat([eye, -eye]), weights, weights, True, reach=size**0.5)
 
     return SigmaPoints("cubature", build, (cubature, ()))
 

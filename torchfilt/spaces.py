@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchfilt.linalg import is_differentiated, triangularize
+from torchfilt.linalg import is_differentiated
 from torchfilt.quaternions import (
     conjugate,
     exponential,
@@ -90,7 +90,24 @@ def weighted_sum(values: Tensor, weights: Tensor) -> Tensor:
 def transport(space: Space, v: Tensor, factor: Tensor) -> Tensor:
     """Factor (..., e, e) of a covariance about x as one about ``retract(x, v)``, lower triangular again."""
     carried = space.carry(v, factor)
-    return factor if carried is factor else triangularize(carried)
+    if carried is factor:
+        return factor
+    curved = curved_components(space, factor.shape[-1])
+    starts = [k for k in curved if k - 1 not in curved]
+    ends = [k + 1 for k in curved if k + 1 not in curved]
+    for start, end in zip(starts, ends, strict=True):
+        carried = _triangular_block(carried, start, end)
+    return carried
+
+
+def _triangular_block(factor: Tensor, start: int, end: int) -> Tensor:
+    """A factor that is lower triangular but for one diagonal block, made so by turning the block's columns."""
+    turn, r = torch.linalg.qr(factor[..., start:end, start:end].mT)
+    diagonal = r.diagonal(dim1=-2, dim2=-1)
+    turn = turn * torch.copysign(diagonal.new_ones(()), diagonal.detach()).unsqueeze(-2)
+    block = torch.nn.functional.pad((factor[..., start:, start:end] @ turn), (0, 0, start, 0))
+    # What the turn leaves above the diagonal is rounding.
+    return torch.cat([factor[..., :start], block, factor[..., end:]], -1).tril()
 
 
 def curved_components(space: Space, size: int) -> tuple[int, ...]:
