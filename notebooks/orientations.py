@@ -117,8 +117,8 @@ assert (sigma.norm(dim=-1) - 1).abs().max() < 1e-14 and four.norm(dim=-1).max() 
 # ## The covariance goes along to the new mean
 # A large correction moves the mean, and rotation vectors about the old mean are not rotation vectors about the new one.
 # `transport` carries the covariance there, by the exact derivative of the change of chart. It is a derivative, so it is
-# right for *small* covariances; how small, the draws tell, to about 0.5 %. The errors have deviations (s, s/2, s/5), the
-# correction is 120 deg. Filters do this after each update, by themselves.
+# right for *small* covariances; how small, the draws tell, to about 0.5 %. The errors have deviations (s, s/2, s/5),
+# the correction is 120 deg. Filters do this after each update, by themselves.
 
 # %%
 turn = torch.tensor([0.3, 1.0, 0.5]).double()
