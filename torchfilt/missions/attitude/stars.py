@@ -163,7 +163,8 @@ class PoseTransition(nn.Module):
         blocks = []
         for sd in (self.rate_sd, self.velocity_sd):
             columns = axes * sd.to(x.dtype)
-            blocks.append(torch.linalg.cholesky(columns @ columns.mT))
+            block, failed = torch.linalg.cholesky_ex(columns @ columns.mT)
+            blocks.append(torch.where((failed > 0)[..., None, None], torch.nan, block))
         zero = torch.zeros_like(blocks[0])
         factor = torch.cat([torch.cat([blocks[0], zero], -1), torch.cat([zero, blocks[1]], -1)], -2)
         assert dt is not None
