@@ -340,4 +340,5 @@ def test_the_bank_follows_the_whole_log(tmp_path):
     settings = StarsSettings(str(DATA), starts=2, particles=100)
     found = run_stars(settings, tmp_path, ("llpf",), say=lambda line: None, figures=False)["filters"]["llpf"]
     assert found["converged"] == 1 and max(found["converged_s"]) < 16
-    assert found["position_m"]["median"] < 0.05 and found["attitude_deg"]["median"] < 2.0
+    assert found["position_m"]["median"] < 0.028 and found["position_m"]["rms"] < 0.056
+    assert found["attitude_deg"]["median"] < 2.0 and found["attitude_deg"]["rms"] < 4.2
