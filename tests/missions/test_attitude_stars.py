@@ -68,6 +68,7 @@ def log():
         ({"member_sd_deg": math.nan}, "member_sd_deg must be positive and finite, got nan"),
         ({"member_sd_m": 0.0}, "member_sd_m must be positive and finite, got 0.0"),
         ({"room_high_m": (5.0, -1.0, 3.0)}, "room_low_m must be below room_high_m"),
+        ({"room_low_m": (0.0, 0.0)}, r"room_high_m, three numbers each, got \(0.0, 0.0\)"),
         ({"room_low_m": (-math.inf, -1.0, 0.0)}, "room_low_m must be below room_high_m"),
         ({"start_s": 5.0, "stop_s": 5.0}, "start_s must be from 0 to below stop_s, got 5.0 and 5.0"),
         ({"start_s": -1.0}, "start_s must be from 0 to below stop_s"),
@@ -155,7 +156,7 @@ def test_derivatives_are_those_of_the_means():
 
 
 def test_sightings_are_the_logs(log):
-    """Reprojection at truth has the stated deviations: all beacons of a frame err alike, so to a third only."""
+    """Reprojection at truth has the deviations that the log states."""
     whole = read_starry_night(DATA)
     truth = torch.cat([whole.quaternion, whole.position_m], -1)
     law = Sightings(whole.beacons_m, whole.camera, whole.tangent_variance[:2].sqrt())(truth)

@@ -91,9 +91,11 @@ class StarsSettings:
         for name in ("starts", "motion_scale", "sighting_scale", "iterations", "particles", "member_sd_deg"):
             _check_positive(name, getattr(self, name))
         _check_positive("member_sd_m", self.member_sd_m)
-        corners = zip(self.room_low_m, self.room_high_m, strict=True)
-        if not all(-math.inf < low < high < math.inf for low, high in corners):
-            raise ValueError(f"room_low_m must be below room_high_m, got {self.room_low_m} and {self.room_high_m}")
+        corners = list(zip(self.room_low_m, self.room_high_m, strict=False))
+        sizes = {len(self.room_low_m), len(self.room_high_m)}
+        if sizes != {3} or not all(-math.inf < low < high < math.inf for low, high in corners):
+            got = f"{self.room_low_m} and {self.room_high_m}"
+            raise ValueError(f"room_low_m must be below room_high_m, three numbers each, got {got}")
         stop = math.inf if self.stop_s is None else self.stop_s
         if not 0 <= self.start_s < stop:
             raise ValueError(f"start_s must be from 0 to below stop_s, got {self.start_s} and {self.stop_s}")
@@ -355,7 +357,7 @@ def follow(name: str, log: StarryNight, settings: StarsSettings, progress: bool 
     for k in tqdm(range(len(steps)), unit="step", disable=None if progress else True):
         beacons = tuple(visible[k].nonzero()[:, 0].tolist()) or (0,)
         y = tangents[k, list(beacons)].flatten().expand(rows, -1)
-        state, info = make(beacons).step(state, y, controls[k], steps[k])
+        state, info = make(beacons).step(state, y, controls[k], steps[k], predict_first=k > 0)
         mean, covariance = state.belief.moments() if name == "llpf" else (state.belief.mean, state.belief.covariance)
         nis = torch.full((rows,), torch.nan) if info.nis is None or not visible[k].any() else info.nis / y.shape[-1]
         kept.append((mean, covariance.expand(rows, _FREEDOM, _FREEDOM), nis.expand(rows)))
