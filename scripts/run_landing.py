@@ -16,7 +16,8 @@ from jsonargparse import ArgumentParser
 
 SCENARIOS = ("nominal", "false-source", "no-barometer", "pad-height", "wide-start")
 FILTERS = (
-    *("ukf", "ukf-restart", "mekf", "iekf", "bootstrap", "llpf-50", "llpf-200", "llpf-1000", "llpf-50-no-restart"),
+    *("ukf", "ukf-restart", "mekf", "iekf", "bootstrap", "llpf-50", "llpf-200", "llpf-1000", "llpf-50-iterated"),
+    *("llpf-50-no-restart",),
     *("llpf-50-redraw", "llpf-50-keep", "llpf-50-literal", "ukf-no-gauge", "mekf-no-gauge", "bootstrap-no-gauge"),
     *("llpf-50-no-gauge", "llpf-200-no-gauge", "llpf-1000-no-gauge"),
 )

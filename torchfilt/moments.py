@@ -119,8 +119,8 @@ class Quadrature(NamedTuple):
     """Nodes (s, e) for a standard normal with weights (s,) of the mean and of the covariance.
 
     ``paired``: nodes are [+c I, -c I], or these after a centre, so slope and residual split without a matrix product;
-    ``central`` is then the centre's covariance weight, ``negative`` whether its mean weight is below zero, ``reach`` is c,
-    all as plain values, so that a compiled step does not branch on tensors.
+    ``central`` is then the centre's covariance weight, ``negative`` says whether its mean weight is below zero and
+    ``reach`` is c, all as plain values, so that a compiled step does not branch on tensors.
     """
 
     nodes: Tensor

@@ -60,6 +60,7 @@ _MAKERS: dict[str, Maker] = {
     "llpf-50": _restarted(_bank(50)),
     "llpf-200": _restarted(_bank(200)),
     "llpf-1000": _restarted(_bank(1000)),
+    "llpf-50-iterated": _restarted(_bank(50, iterations=3)),
     "llpf-50-no-restart": _bank(50),
     "llpf-50-redraw": _bank(50, redraw="always", split=0.99),
     "llpf-50-keep": _bank(50, redraw="always", split=None),
