@@ -152,13 +152,18 @@ def test_closed_derivatives_are_those_of_central_differences(name):
         step = torch.zeros(11).double()
         step[k] = h
         ahead, behind = (law(DESCENT_SPACE.retract(x, sign * step), *more).mean for sign in (1, -1))
-        slope = space.local(ahead, behind) / (2 * h)
+        slope = space.local(behind, ahead) / (2 * h)
         # Rounding of the value (1e5 Pa, 2500 m) over h, and h^2 times a third derivative below 100.
         torch.testing.assert_close(jacobian[..., k], slope, rtol=1e-6, atol=1e-5)
 
 
 def test_motion_turns_by_the_gyro_and_keeps_its_channel():
-    settings = DescentSettings(horizontal_sd_m_s2=3.0, horizontal_time_s=0.7, gyro_bias_walk_rad_s_sqrt_s=0.01)
+    settings = DescentSettings(
+        horizontal_sd_m_s2=3.0,
+        horizontal_time_s=0.7,
+        angle_random_walk_rad_sqrt_s=0.05,
+        gyro_bias_walk_rad_s_sqrt_s=0.01,
+    )
     motion, x = DescentMotion(settings, 0.2), states(5)
     rate = torch.tensor([0.4, -3.0, 1.0]).double()
     law = motion(x, rate)
@@ -227,10 +232,12 @@ def test_a_filter_starts_with_its_force_levelled(short):
 def test_linear_part_equals_a_plain_kalman_filter(short):
     """The extended filter of the barometer against its textbook form in NumPy."""
     found = follow("baro-ekf", short, SHORT)
-    transition, factor = (part.numpy() for part in gauss_markov(short.step_s, 1.0, 1.0))
+    transition, factor = (
+        part.numpy() for part in gauss_markov(short.step_s, SHORT.vertical_time_s, SHORT.vertical_sd_m_s2)
+    )
     smooth, stamp = short.smooth_m.numpy(), short.time_s.numpy()
     mean = np.array([smooth[0], (smooth[-1] - smooth[0]) / (stamp[-1] - stamp[0]), 0.0])
-    covariance = np.diag([25.0, 100.0, 1.0])
+    covariance = np.diag([25.0, 100.0, SHORT.vertical_sd_m_s2**2])
     for k, pressure in enumerate(short.pressure_pa[:, 3].numpy()):
         mean = transition @ mean
         covariance = transition @ covariance @ transition.T + factor @ factor.T
@@ -239,7 +246,7 @@ def test_linear_part_equals_a_plain_kalman_filter(short):
             power = 9.80665 * 0.0289644 / (8.31432 * 6.5e-3)
             slope = -short.ground_pa * power * ratio ** (power - 1) / (288.15 / 6.5e-3)
             row = slope * np.array([1, -short.step_s / 2, 0])
-            gain = covariance @ row / (row @ covariance @ row + 15.0**2)
+            gain = covariance @ row / (row @ covariance @ row + SHORT.pressure_sd_pa**2)
             mean = mean + gain * (pressure - short.ground_pa * ratio**power)
             covariance = covariance - np.outer(gain, row @ covariance)
         # Rounding of a pressure of 1e5 Pa by 10 Pa/m over some hundred steps.
