@@ -18,7 +18,7 @@ from torchfilt.linalg import apply_factor, for_points, triangularize
 from torchfilt.particles import Particles
 from torchfilt.spaces import Euclidean, Space, centred, transport
 
-__all__ = ["InitialMixture", "MixtureLaw", "check_probabilities", "merge", "reduce", "split_gaussian"]
+__all__ = ["InitialMixture", "MixtureLaw", "check_probabilities", "factors_of", "merge", "reduce", "split_gaussian"]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -33,7 +33,7 @@ def merge(mixture: Particles) -> Gaussian:
     Raises:
         ValueError: particles without covariances.
     """
-    factor, space, weights = _factors(mixture), mixture.space, mixture.weights
+    factor, space, weights = factors_of(mixture), mixture.space, mixture.weights
     mean, errors = centred(space, mixture.x, weights)
     root = _root(weights).unsqueeze(-1)
     own = space.carry(-errors, factor).expand(*errors.shape, -1) * root.unsqueeze(-1)
@@ -43,6 +43,8 @@ def merge(mixture: Particles) -> Gaussian:
 
 def reduce(mixture: Particles, count: int) -> Particles:
     """Merge pairs until ``count`` components are left; mean and covariance of the mixture stay what they are.
+
+    That is exact on flat spaces; on curved ones a pair is merged in the tangent space at its own mean.
 
     The next pair is the one of the smallest B = (w_ij log|P_ij| - w_i log|P_i| - w_j log|P_j|) / 2, an upper bound on
     what its merger changes, in Kullback-Leibler divergence. Each row chooses its own pairs; no shape depends on
@@ -59,7 +61,7 @@ def reduce(mixture: Particles, count: int) -> Particles:
     """
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
-    factor, space, n = _factors(mixture), mixture.space, mixture.x.shape[-2]
+    factor, space, n = factors_of(mixture), mixture.space, mixture.x.shape[-2]
     if n <= count:
         return mixture
     factor = factor.expand(*mixture.x.shape[:-1], *factor.shape[-2:])
@@ -67,11 +69,11 @@ def reduce(mixture: Particles, count: int) -> Particles:
     scale = _deviations(mixture)
     alive = torch.ones_like(mixture.log_weights, dtype=torch.bool)
     places = torch.arange(n, device=factor.device)
-    rows, columns = _ranked(mixture, -2), _ranked(mixture, -3)
-    cost = _bound(rows, columns, space, scale.unsqueeze(-2).unsqueeze(-2))
-    cost = cost.masked_fill(torch.eye(n, dtype=torch.bool, device=factor.device), math.inf)
+    ahead = torch.ones((n, n), dtype=torch.bool, device=factor.device).triu(1)  # each pair once
+    cost = _bound(_ranked(mixture, -2), _ranked(mixture, -3), space, scale.unsqueeze(-2).unsqueeze(-2))
     for _ in range(n - count):
-        best = cost.flatten(-2).argmin(-1, keepdim=True)
+        pairs = ahead & alive.unsqueeze(-1) & alive.unsqueeze(-2)
+        best = torch.where(pairs, cost, math.inf).flatten(-2).argmin(-1, keepdim=True)
         first, second = best // n, best % n
         into, gone = places == first, places == second
         alive = alive & ~gone
@@ -86,10 +88,8 @@ def reduce(mixture: Particles, count: int) -> Particles:
         )
         merged = Particles(one.mean.unsqueeze(-2), weight, one.scale_tril.unsqueeze(-3), space)
         fresh = _bound(_ranked(merged), _ranked(mixture), space, scale.unsqueeze(-2))
-        fresh = torch.where(alive & ~into, fresh, math.inf)
         cost = torch.where(into.unsqueeze(-1), fresh.unsqueeze(-2), cost)
         cost = torch.where(into.unsqueeze(-2), fresh.unsqueeze(-1), cost)
-        cost = torch.where(gone.unsqueeze(-1) | gone.unsqueeze(-2), math.inf, cost)
     kept = (~alive).to(torch.int8).argsort(stable=True, dim=-1)[..., :count]
     return _pick(mixture, kept)
 
@@ -165,7 +165,12 @@ def _root(weights: Tensor) -> Tensor:
     return torch.where(present, torch.where(present, weights, 1).sqrt(), weights)
 
 
-def _factors(mixture: Particles) -> Tensor:
+def factors_of(mixture: Particles) -> Tensor:
+    """Factors (*batch, n or 1, e, e) of the components.
+
+    Raises:
+        ValueError: points without covariances.
+    """
     if mixture.scale_tril is None:
         raise ValueError("a mixture of Gaussians needs a factor for its components, these particles are points")
     return mixture.scale_tril
@@ -276,11 +281,13 @@ class InitialMixture(nn.Module):
         super().__init__()
         if not isinstance(mixture, Particles):
             raise TypeError(f"mixture must be Particles with factors, got {type(mixture).__name__}")
-        factor, lead = _factors(mixture), mixture.x.shape[:-1]
+        factor, lead = factors_of(mixture), mixture.x.shape[:-1]
         check_finite(mixture.x, "x")
         check_factor(factor, "scale_tril")
         check_probabilities(mixture.log_weights.exp(), "weights")
-        if mixture.log_weights.shape != lead or factor.dim() < 3 or factor.shape[-3] not in (1, lead[-1]):
+        size = mixture.space.tangent_size if mixture.space.tangent_size is not None else mixture.x.shape[-1]
+        members = factor.shape[:-2] in (lead, (*lead[:-1], 1), lead[-1:], (1,))
+        if mixture.log_weights.shape != lead or not members or factor.shape[-1] != size:
             raise ValueError(
                 f"a mixture has x (*batch, n, d), log_weights (*batch, n) and factors (*batch, n or 1, e, e), got "
                 f"{tuple(mixture.x.shape)}, {tuple(mixture.log_weights.shape)} and {tuple(factor.shape)}"

@@ -10,9 +10,10 @@ from torch.distributions import MixtureSameFamily
 from torchfilt.gates import Gate, by_sensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import hold
-from torchfilt.mixture import InitialMixture, MixtureLaw, check_probabilities, merge, reduce
+from torchfilt.mixture import InitialMixture, MixtureLaw, check_probabilities, factors_of, merge, reduce
 from torchfilt.model import StateSpaceModel, as_gaussian, check_batch
-from torchfilt.moments import Rule, Update, check_rule_type, predict, unscented, update
+from torchfilt.moments import Rule, Update, check_rule_type, unscented, update
+from torchfilt.moments import predict as predicted
 from torchfilt.particles import Particles
 from torchfilt.run import Filter, check_model
 from torchfilt.spaces import Euclidean
@@ -37,7 +38,7 @@ class GaussianSumFilter(Filter[Particles]):
 
     Raises:
         ValueError: components below 1, a gate without outlier_log_density.
-        TypeError: not a model, not a moment rule, not a gate; in a step, a law that gives torch mixtures.
+        TypeError: not a model, not a moment rule, not a gate.
 
     Source: Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE TAC 17 (1972).
     """
@@ -65,8 +66,7 @@ class GaussianSumFilter(Filter[Particles]):
         mixture = _mixture_of(self.model)
         check_batch(mixture.x.shape[:-2], batch_shape)
         lead = (*batch_shape, mixture.x.shape[-2])
-        factor = mixture.scale_tril
-        assert factor is not None
+        factor = factors_of(mixture)
         belief = Particles(
             mixture.x.expand(*lead, -1),
             mixture.log_weights.expand(lead),
@@ -89,7 +89,7 @@ class GaussianSumFilter(Filter[Particles]):
         u = u.unsqueeze(-2) if u is not None and u.dim() > 1 else u
         dt = dt.unsqueeze(-2) if isinstance(dt, Tensor) and dt.dim() > 1 else dt
         weights = belief.log_weights
-        bank = Gaussian(belief.x, _factor_of(belief), belief.space)
+        bank = Gaussian(belief.x, factors_of(belief), belief.space)
         if predict:
             bank, weights = self._predict(bank, weights, u, dt)
         results = [
@@ -102,7 +102,7 @@ class GaussianSumFilter(Filter[Particles]):
 
     def _predict(self, bank: Gaussian, log_weights: Tensor, u: Tensor | None, dt: Step) -> tuple[Gaussian, Tensor]:
         """Every component by every motion."""
-        moved = [_predicted(model, bank, self.rule, u, dt) for model in self._motions]
+        moved = [predicted(model.moments("transition"), bank, self.rule, u, dt) for model in self._motions]
         law = self.model.transition
         law = law.law if isinstance(law, GaugedTransition) else law
         return _side_by_side(moved), _multiplied(log_weights, _log_chances(law, log_weights))
@@ -170,6 +170,8 @@ class InteractingMultipleModel(Filter[Particles]):
             if given is None:
                 setattr(self, name, None)
                 continue
+            if not isinstance(given, Tensor):
+                raise TypeError(f"{name} must be a tensor, got {type(given).__name__}")
             if given.shape != shape:
                 raise ValueError(f"{name} must be {shape} for {m} models, got {tuple(given.shape)}")
             if given.dtype != like.dtype:
@@ -213,11 +215,11 @@ class InteractingMultipleModel(Filter[Particles]):
             belief = self._mix(belief, dt)
         u = u.unsqueeze(-2) if u is not None and u.dim() > 1 else u
         dt = dt.unsqueeze(-2) if isinstance(dt, Tensor) and dt.dim() > 1 else dt
-        factor, results = _factor_of(belief), []
+        factor, results = factors_of(belief), []
         for k, model in enumerate(self._each()):
             one = Gaussian(belief.x[..., k : k + 1, :], factor[..., k : k + 1, :, :], belief.space)
             if predict:
-                one = _predicted(model, one, self.rule, u, dt)
+                one = predicted(model.moments("transition"), one, self.rule, u, dt)
             law = model.moments("observation")
             results.append(update(law, one, y.unsqueeze(-2), self.rule, missing, 1, u, dt, self.gate))
         return _weigh(results, belief.log_weights, self.evidence, self.model)
@@ -236,7 +238,7 @@ class InteractingMultipleModel(Filter[Particles]):
         joint = torch.where(reached, joint, own)  # a mode that can't be reached keeps what it has
         ahead = torch.where(reached.squeeze(-2), torch.logsumexp(joint, -2), -math.inf)
         mixture = Particles(
-            belief.x.unsqueeze(-3), torch.log_softmax(joint.mT, -1), _factor_of(belief).unsqueeze(-4), belief.space
+            belief.x.unsqueeze(-3), torch.log_softmax(joint.mT, -1), factors_of(belief).unsqueeze(-4), belief.space
         )
         shape = mixture.log_weights.shape
         mixed = merge(mixture._replace(x=mixture.x.expand(*shape, -1)))
@@ -278,16 +280,6 @@ def _bank_gate(gate: Gate | None) -> Gate | None:
     if gate is not None and gate.outlier_log_density is None:
         raise ValueError("a gate of several Gaussians needs outlier_log_density, what a refused measurement weighs")
     return gate
-
-
-def _predicted(model: StateSpaceModel, bank: Gaussian, rule: Rule, u: Tensor | None, dt: Step) -> Gaussian:
-    return predict(model.moments("transition"), bank, rule, u, dt)
-
-
-def _factor_of(belief: Particles) -> Tensor:
-    if belief.scale_tril is None:
-        raise ValueError("a mixture of Gaussians needs a factor for its components, these particles are points")
-    return belief.scale_tril
 
 
 def _log(probabilities: Tensor) -> Tensor:
@@ -354,7 +346,7 @@ def _mixture_of(model: StateSpaceModel) -> Particles:
         return Particles(prior.mean.unsqueeze(-2), torch.zeros_like(prior.mean[..., :1]), factor, prior.space)
     if model.gauge is None:
         return mixture
-    turned = into_gauge(model.gauge, Gaussian(mixture.x, _factor_of(mixture), mixture.space))
+    turned = into_gauge(model.gauge, Gaussian(mixture.x, factors_of(mixture), mixture.space))
     return mixture._replace(x=turned.mean, scale_tril=turned.scale_tril)
 
 
