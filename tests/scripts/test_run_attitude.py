@@ -37,6 +37,7 @@ def test_it_runs_refuses_to_overwrite_and_goes_on(tmp_path):
     assert (settings["seed"], settings["particles"]) == (3, 7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "folder"), [("imu-mag", "imu_mag_mocap"), ("stars", "starry_night")])
 def test_each_scenario_has_its_study(tmp_path, scenario, folder):
     data = ROOT / "data" / folder

@@ -82,7 +82,7 @@ class DescentSettings:
         data: folder of the log.
         start_s, stop_s: part of the flight; settle_s: after the start, before anything is scored or withheld.
         group: rows of a step. barometer_every: steps from one pressure to the next; the noise of neighbours is alike.
-        pressure_sd_pa: of a step's mean pressure.
+        pressure_sd_pa: of a step's mean pressure; larger than its scatter, since its noise is not white.
         vertical_sd_m_s2, vertical_time_s: of the vertical acceleration, a Gauss-Markov process.
         horizontal_sd_m_s2, horizontal_time_s: of each horizontal one; ``imu`` only, as all that follow but the last.
         force_sd_m_s2: of a step's mean specific force; a lever arm to the body's centre included.
@@ -103,13 +103,13 @@ class DescentSettings:
     settle_s: float = 15.0
     group: int = 10
     barometer_every: int = 5
-    pressure_sd_pa: float = 15.0
-    vertical_sd_m_s2: float = 1.0
-    vertical_time_s: float = 1.0
-    horizontal_sd_m_s2: float = 4.0
+    pressure_sd_pa: float = 30.0
+    vertical_sd_m_s2: float = 0.4
+    vertical_time_s: float = 0.7
+    horizontal_sd_m_s2: float = 5.0
     horizontal_time_s: float = 0.5
-    force_sd_m_s2: float = 1.0
-    angle_random_walk_rad_sqrt_s: float = 0.05
+    force_sd_m_s2: float = 0.7
+    angle_random_walk_rad_sqrt_s: float = 0.08
     gyro_bias_walk_rad_s_sqrt_s: float = 1e-4
     prior_bias_sd_rad_s: float = 0.01
     prior_tilt_sd_deg: float = 60.0
