@@ -28,7 +28,7 @@ def test_a_short_run_lands(outcome):
     assert entry["converged"] == 1.0 and entry["failed"] == 0 and entry["ms_one_vehicle"] > 0
     assert json.loads((folder / "metrics.json").read_text()) == summary
     assert any("mekf-no-gauge" in line for line in said)
-    assert {path.name for path in (folder / "figures").iterdir()} == {"errors.png", "paths.png"}
+    assert {path.name for path in (folder / "figures").iterdir()} == {"errors.png", "particles.png", "paths.png"}
 
 
 def test_finished_stages_are_kept(outcome):

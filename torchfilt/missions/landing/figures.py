@@ -7,6 +7,7 @@ import numpy as np
 
 from torchfilt.missions.landing.scene import Scene
 from torchfilt.missions.stages import Arrays
+from torchfilt.particles import Particles
 
 _BEFORE_S, _AFTER_S = 2.0, 11.0
 
@@ -14,7 +15,8 @@ _BEFORE_S, _AFTER_S = 2.0, 11.0
 def landing_figures(results: dict[str, Arrays], scene: Scene, folder: Path) -> list[Path]:
     """Draw them; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
-    return [_errors(results, scene, folder / "errors.png"), _paths(results, scene, folder / "paths.png")]
+    drawn = [_errors(results, scene, folder / "errors.png"), _paths(results, scene, folder / "paths.png")]
+    return [*drawn, _particles(scene, folder / "particles.png")]
 
 
 def _since_sight(values: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -49,6 +51,40 @@ def _errors(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
             axis.set(title=title, yscale="log", xlabel="s since the beacon was first seen")
     axes[0][0].legend(fontsize=7)
     figure.suptitle("Errors at heading zero: median, 10 % to 90 % of the runs")
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def _particles(scene: Scene, path: Path) -> Path:
+    """Paths of the particles of one vehicle, each line from a particle to its child."""
+    from matplotlib.collections import LineCollection
+
+    from torchfilt.filters.particle_methods import BootstrapFilter, LocallyLinearizedParticleFilter
+
+    trackers = {
+        "bootstrap, 200 particles": BootstrapFilter(scene.model, 200),
+        "LLPF, 50 Gaussians": LocallyLinearizedParticleFilter(scene.model, 50),
+    }
+    figure, axes = _new(1, len(trackers), (11, 5.5))
+    truth = scene.model.representative(scene.truth[:, 0])[..., 7:9].numpy()
+    first = int(scene.acquired[0])
+    last = min(first + round(3 / scene.dt), len(truth))
+    for axis, (name, tracker) in zip(axes[0], trackers.items(), strict=True):
+        history = tracker(
+            scene.measurements[:last, :1], scene.controls[:last, :1], scene.dt, record="beliefs", throw=False
+        )
+        assert isinstance(history.beliefs, Particles) and history.diagnostics.ancestors is not None
+        places = scene.model.representative(history.beliefs.x[:, 0])[..., 7:9].numpy()
+        parents = history.diagnostics.ancestors[:, 0].numpy()
+        shown = slice(None, None, places.shape[1] // 50)
+        born = np.stack([places[k - 1][parents[k]] for k in range(1, last)])
+        lines = np.stack([born, places[1:]], 2)[:, shown]
+        for part, colour in ((lines[: first - 1], "C1"), (lines[first - 1 :], "C0")):
+            axis.add_collection(LineCollection(list(part.reshape(-1, 2, 2)), colors=colour, linewidths=0.5, alpha=0.5))
+        axis.plot(*truth[:last].T, color="0.3", linewidth=2)
+        axis.plot(0, 0, "k+", markersize=12)
+        axis.set(title=name, xlim=(-50, 50), ylim=(-50, 50), aspect="equal", xlabel="right, m", ylabel="forward, m")
+    figure.suptitle("Particles of one vehicle at heading zero: before (orange) and after (blue) it sees the beacon")
     figure.savefig(path, dpi=120)
     return path
 

@@ -164,7 +164,7 @@ def summarize(result: Arrays, acquired: Tensor, dt: float) -> dict[str, Any]:
     return summary
 
 
-def time_one_vehicle(name: str, settings: LandingSettings, steps: int = 150) -> float:
+def time_one_vehicle(name: str, settings: LandingSettings, steps: int = 80) -> float:
     """Median wall time of a step in ms for one vehicle, eager, with the threads that torch has, the beacon in view."""
     scene = make_scene(LandingSettings(settings.scenario, 1, settings.seed))
     tracker, first = make_filter(name, scene), int(scene.acquired[0]) - 10
