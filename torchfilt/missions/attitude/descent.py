@@ -596,7 +596,10 @@ def _figures(results: dict[str, Arrays], descent: Descent, folder: Path) -> list
         place = [length * (1 + 0.04 * (k - len(results) / 2)) for _, _, length in descent.ends]
         error = [result["mean"][step, row, 0] - smooth[step] for row, step, _ in descent.ends]
         axes[0, 0].plot(place, error, ".", ms=4, alpha=0.6, color=COLOURS[k % len(COLOURS)], label=title)
+    lengths = sorted({length for _, _, length in descent.ends})
     axes[0, 0].set_xscale("log")
+    axes[0, 0].set_xticks(lengths, [f"{length:g}" for length in lengths])
+    axes[0, 0].set_xticks([], minor=True)
     axes[0, 0].set_xlabel("without barometer, s")
     axes[0, 0].set_ylabel("m")
     axes[0, 0].grid(alpha=0.25, lw=0.5)
