@@ -188,8 +188,8 @@ def test_one_model_is_the_exact_filter():
 def test_the_right_model_is_found(truth):
     """A mode that stays, 100 runs of 60 steps, noise of deviation 1 or 2.
 
-    The log-ratio is a scaled chi-square variable of 60 degrees less a constant: a run ends below 0.9 with a chance below
-    1e-3, three of 100 with one below 2e-4.
+    The log-ratio is a scaled chi-square variable of 60 degrees less a constant: a run ends below 0.9 with a chance
+    below 1e-3, three of 100 with one below 2e-4.
     """
     filter = tf.InteractingMultipleModel([still(1.0), still(4.0)], torch.eye(2, dtype=DOUBLE))
     rng = np.random.default_rng(truth)
@@ -345,7 +345,7 @@ def test_saved_loaded_and_resumed(tmp_path):
     loaded = tf.History.load(tmp_path / "run.npz")
     rest = filter(ys[5:], state=loaded.final, record="beliefs")
     assert torch.equal(rest.mean, whole.mean[5:]) and torch.equal(rest.beliefs.weights, whole.beliefs.weights[5:])
-    other = tf.InteractingMultipleModel([model(0), model(0)], tensor(JUMP[::-1]))
+    other = tf.InteractingMultipleModel([model(0), model(0)], tensor(np.eye(2)))
     other.load_state_dict(filter.state_dict())
     assert torch.equal(other(ys).mean, whole.mean)
 
