@@ -28,11 +28,10 @@ from torch.nn.functional import pad
 import torchfilt as tf
 from torchfilt.io.rocket_descent import RocketDescent, read_rocket_descent
 from torchfilt.laws import hold
+from torchfilt.missions.attitude.motion import to_ends
 from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
 from torchfilt.models.attitude import (
-    from_rotation_vector,
     inverse,
-    multiply,
     rotate,
     skew,
     to_matrix,
@@ -311,7 +310,7 @@ def make_descent(log: RocketDescent, settings: DescentSettings) -> Descent:
         for values in (log.gyro_rad_s, log.accel_m_s2, log.pressure_pa)
     )
     step_s = settings.group * row_s
-    turn, force = _to_ends(gyro * row_s, accel)
+    turn, force = to_ends(gyro * row_s, accel)
     ground = log.pressure_pa[log.times_s < 0].median().item()
     last = first + settings.group * torch.arange(1, steps + 1)
     stamp = log.times_s[last]
@@ -325,16 +324,6 @@ def make_descent(log: RocketDescent, settings: DescentSettings) -> Descent:
     ]
     rate = to_rotation_vector(turn) / step_s
     return Descent(stamp, rate, force, measured, withheld, ends, step_s, ground, smooth, torch.stack(other, -1))
-
-
-def _to_ends(angle: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-    """Turn (k, 4) of groups of small turns (k, n, 3), and the mean of vectors (k, n, 3) in the axes of their ends."""
-    turns = from_rotation_vector(angle)
-    after, total = turns[:, -1], force[:, -1]
-    for i in reversed(range(angle.shape[1] - 1)):
-        total = total + rotate(inverse(after), force[:, i])
-        after = multiply(turns[:, i], after)
-    return after, total / angle.shape[1]
 
 
 def _smooth(height: Tensor, at: Tensor, half: int) -> Tensor:

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 import torchfilt as tf
 from torchfilt.io.imu_mag_mocap import ImuMagLog, read_imu_mag_mocap
+from torchfilt.missions.attitude.motion import to_ends
 from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
 from torchfilt.models.attitude import from_rotation_vector, inverse, multiply, rotate, to_rotation_vector
 from torchfilt.models.attitude.kinematics import ATTITUDE_SPACE, GyroTransition, VectorMeasurement
@@ -145,7 +146,7 @@ def make_motion(log: ImuMagLog, settings: ImuMagSettings) -> Motion:
         values[rows].unflatten(0, (steps, settings.group))
         for values in (log.gyro_rad_s, log.accel_m_s2, held * _MICROTESLA)
     ]
-    turn, force, field = _to_ends(grouped[0] * row_s, grouped[1], grouped[2])
+    turn, force, field = to_ends(grouped[0] * row_s, grouped[1], grouped[2])
     step_s = settings.group * row_s
     still = slice(first, int(moved[0]))
     gravity, reference = _references(log, still, seen[still])
@@ -184,25 +185,13 @@ def field_delay(log: ImuMagLog) -> int:
     return int(torch.stack(misfit).argmin())
 
 
-def _to_ends(angle: Tensor, *vectors: Tensor) -> tuple[Tensor, ...]:
-    """Turn (k, 4) of groups of small turns (k, n, 3), and means of vectors (k, n, 3) in the axes of their ends."""
-    turns = from_rotation_vector(angle)
-    after = torch.zeros_like(turns[:, 0])
-    after[:, 3] = 1
-    sums = [torch.zeros_like(v[:, 0]) for v in vectors]
-    for i in reversed(range(angle.shape[1])):
-        sums = [total + rotate(inverse(after), v[:, i]) for total, v in zip(sums, vectors, strict=True)]
-        after = multiply(turns[:, i], after)
-    return after, *(total / angle.shape[1] for total in sums)
-
-
 def _blocks(turn: Tensor, size: int, *vectors: Tensor) -> list[Tensor]:
     """Means of blocks of steps at their last one, NaN elsewhere."""
     count = len(turn) // size
     found = [torch.full_like(v, torch.nan) for v in vectors]
     if count:
         angle = to_rotation_vector(turn[: count * size]).unflatten(0, (count, size))
-        _, *means = _to_ends(angle, *(v[: count * size].unflatten(0, (count, size)) for v in vectors))
+        _, *means = to_ends(angle, *(v[: count * size].unflatten(0, (count, size)) for v in vectors))
         for whole, mean in zip(found, means, strict=True):
             whole[size - 1 : count * size : size] = mean
     return found
