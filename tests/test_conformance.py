@@ -14,7 +14,9 @@ import torchfilt as tf
 from torchfilt import moments, resampling
 from torchfilt.gp import GPTransition
 from torchfilt.gp.regression import GPRegression
+from torchfilt.io.starry_night import Camera
 from torchfilt.kernels import Regularize
+from torchfilt.missions.attitude import stars
 from torchfilt.models import landing, relative_motion
 from torchfilt.models.attitude import ATTITUDE_SPACE, GyroTransition, VectorMeasurement
 from torchfilt.models.inertial import error_model, navigation
@@ -79,6 +81,10 @@ STATES = navigation.NAVIGATION_SPACE.retract(
 ATTITUDES = ATTITUDE_SPACE.retract(
     torch.tensor([0.5, -0.5, 0.5, 0.5, 0.01, 0.0, -0.01], dtype=DOUBLE), normal(5, 6, seed=22)
 )
+POSES = stars.POSE_SPACE.retract(
+    torch.tensor([0.5, -0.5, 0.5, 0.5, 1.0, 2.0, -1.0], dtype=DOUBLE), normal(5, 6, seed=25)
+)
+CAMERA = Camera(torch.tensor([0.5, 0.5, -0.5, 0.5], dtype=DOUBLE), normal(3, seed=26, scale=0.1), 0.24)
 INCREMENTS = torch.cat(increments(FLOWN.dtheta_rad / 0.01, FLOWN.dvelocity_m_s / 0.01, 0.01, 20), -1)
 IMU_WALKS = dict(
     angle_random_walk_rad_sqrt_s=1e-4,
@@ -175,6 +181,13 @@ LAWS = {
     ),
     "VectorMeasurement": (VectorMeasurement(normal(3, seed=24), 0.2), ATTITUDES, None, None),
     "VectorMeasurement of a navigation state": (VectorMeasurement(normal(3, seed=24), 0.2), STATES, None, None),
+    "PoseTransition": (
+        stars.PoseTransition(*normal(2, 3, seed=27).exp()),
+        POSES,
+        normal(5, 6, seed=28),
+        torch.tensor([[0.1], [0.2], [0.5], [1.0], [0.05]], dtype=DOUBLE),
+    ),
+    "Sightings": (stars.Sightings(10 * normal(4, 3, seed=29), CAMERA, normal(2, seed=30).exp()), POSES, None, None),
     "NavigationFixes": (NavigationFixes(position_sd_m=2.0, heading_sd_rad=0.1), STATES, None, None),
     "NavigationFixes all, with arms": (
         NavigationFixes(
@@ -243,7 +256,7 @@ def test_every_law_is_registered():
     laws = {type(law).__name__ for law, *_ in LAWS.values()}
     shipped = {
         name
-        for module in (tf.laws, tf.sensors, relative_motion, error_model, navigation, tf.gp)
+        for module in (tf.laws, tf.sensors, relative_motion, error_model, navigation, stars, tf.gp)
         for name, member in inspect.getmembers(module, inspect.isclass)
         if issubclass(member, nn.Module)
         and inspect.signature(member.forward).return_annotation in (tf.Gaussian, "Gaussian")
@@ -374,6 +387,68 @@ PARTICLE = {
 }
 
 
+class Noisy(nn.Module):
+    """A law with five times its noise."""
+
+    def __init__(self, law):
+        super().__init__()
+        self.law = law
+
+    def forward(self, x, u, dt):
+        usual = self.law(x, u, dt) if isinstance(self.law, tf.AdditiveGaussian) else self.law(x, u)
+        return usual._replace(scale_tril=5 * usual.scale_tril)
+
+
+def doubtful(model, name="observation", make=lambda law: tf.MixtureLaw([law, Noisy(law)], [0.9, 0.1])):
+    """A law that is now and then five times as noisy."""
+    laws = {"transition": model.transition, "observation": model.observation}
+    return tf.StateSpaceModel(model.initial, **(laws | {name: make(laws[name])}))
+
+
+def pieces(model, count=4):
+    """The prior in a row along its first component."""
+    split = tf.InitialMixture(tf.split_gaussian(model.prior(), count, 0))
+    return tf.StateSpaceModel(split, model.transition, model.observation, gauge=model.gauge)
+
+
+CHANCES = torch.tensor([[0.9, 0.1], [0.3, 0.7]], dtype=DOUBLE)
+MIXTURE = {
+    "GaussianSumFilter": lambda m: tf.GaussianSumFilter(pieces(m)),
+    "GaussianSumFilter merged": lambda m: tf.GaussianSumFilter(doubtful(pieces(m)), moments.taylor(), components=5),
+    "GaussianSumFilter noisy motion": lambda m: tf.GaussianSumFilter(doubtful(m, "transition"), components=3),
+    "InteractingMultipleModel": lambda m: tf.InteractingMultipleModel([m, doubtful(m, make=Noisy)], CHANCES),
+    "InteractingMultipleModel taylor": lambda m: tf.InteractingMultipleModel(
+        [m, pieces(m)], CHANCES, moments.taylor(), torch.tensor([0.8, 0.2], dtype=DOUBLE)
+    ),
+}
+
+
+LONG = ("GaussianSumFilter merged", "InteractingMultipleModel taylor")  # on quaternions
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        pytest.param(name, model, marks=pytest.mark.slow if model == "turning" and name in LONG else ())
+        for name in MIXTURE
+        for model in MODELS
+    ],
+)
+def test_filters_of_mixtures(name, model):
+    laws, ys = MODELS[model]
+    check_filter(MIXTURE[name](laws), ys)
+
+
+@pytest.mark.parametrize("name", ["GaussianSumFilter", "rates"])
+def test_filters_of_mixtures_with_controls_and_time_steps(name):
+    filter = tf.InteractingMultipleModel([SWINGING, pieces(SWINGING)], rates_per_s=CHANCES - CHANCES.sum(-1).diag())
+    filter = MIXTURE[name](SWINGING) if name in MIXTURE else filter
+    ys = MODELS["swinging"][1]
+    dt = torch.tensor([0.1, 0.0, 0.2, 0.1, 0.3, 0.1], dtype=DOUBLE)
+    check_filter(filter, ys, normal(6, 2), dt)
+    check_filter(filter, ys, normal(6, 3, 2), dt.unsqueeze(-1) * torch.tensor([1.0, 0.5, 2.0]))
+
+
 @pytest.mark.parametrize(
     ("name", "model"),
     [
@@ -443,8 +518,11 @@ GUARDED = {
     "Reacquire LLPF": lambda m: tf.robust.Reacquire(
         tf.LocallyLinearizedParticleFilter(m, 20, gate=GATE), "swing", 0.15
     ),
+    "GaussianSumFilter gated": lambda m: tf.GaussianSumFilter(pieces(m), gate=GATE),
+    "InteractingMultipleModel gated": lambda m: tf.InteractingMultipleModel([m, pieces(m)], CHANCES, gate=GATE),
 }
 SEEN = {name: GAUSSIAN[name] for name in ("ExtendedKalmanFilter", "UnscentedKalmanFilter iterated")}
+SEEN |= {"GaussianSumFilter": MIXTURE["GaussianSumFilter"]}
 SEEN |= {name: PARTICLE[name] for name in ("Bootstrap moved", "Regularized", "UPF pooled", "LLPF", "RBPF first drawn")}
 
 
@@ -456,6 +534,7 @@ def test_filters_of_sensors(name):
 
 
 TURNED = ("ExtendedKalmanFilter", "UnscentedKalmanFilter", "Bootstrap adaptive stratified", "Regularized", "LLPF")
+TURNED += ("GaussianSumFilter",)
 
 
 @pytest.mark.parametrize("name", TURNED)
@@ -465,7 +544,9 @@ def test_filters_in_a_gauge(name, own):
     gauge = symmetry_problem.NoseEast() if own else symmetry_problem.nose_east
     model = symmetry_problem.model(gauge, sensors, symmetry_problem.Drive(0.1))
     ys = torch.cat([normal(6, 3, 2, seed=9, scale=0.4), 11 + normal(6, 3, 1, seed=10)], -1)
-    check_filter((GAUSSIAN | PARTICLE)[name](model), ys, torch.tensor(symmetry_problem.US[:6]), symmetry_problem.DT)
+    check_filter(
+        (GAUSSIAN | PARTICLE | MIXTURE)[name](model), ys, torch.tensor(symmetry_problem.US[:6]), symmetry_problem.DT
+    )
 
 
 PLANE = torch.tensor([[1.0, 2.0, 0.5], [-3.0, 1.0, -2.5], [0.3, -4.0, 3.0]], dtype=DOUBLE)

@@ -118,6 +118,7 @@ def test_components_grow_to_their_number_and_are_recorded():
     history = filter(tensor(series(4)), record="beliefs")
     assert history.beliefs.x.shape == (4, 2, 9, 2)
     close(history.beliefs.weights.sum(-1), np.ones((4, 2)))
+    close(history.diagnostics.ess, history.beliefs.ess)
     close(history.beliefs.mean, history.mean)
     close(history.beliefs.covariance, history.covariance)
 

@@ -98,7 +98,8 @@ class GaussianSumFilter(Filter[Particles]):
         ]
         weights = _multiplied(weights, _log_chances(self.model.observation, weights))
         after, info = _weigh(results, weights, self.evidence, self.model)
-        return reduce(after, self.components), info
+        after = reduce(after, self.components)
+        return after, info._replace(ess=after.ess)
 
     def _predict(self, bank: Gaussian, log_weights: Tensor, u: Tensor | None, dt: Step) -> tuple[Gaussian, Tensor]:
         """Every component by every motion."""
