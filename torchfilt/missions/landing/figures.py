@@ -39,17 +39,24 @@ def _new(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
 
 
 def _errors(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
-    figure, axes = _new(1, 3, (13, 4))
+    """Medians with the middle 80 %, and the share of the runs that are near; of the first ten filters."""
+    figure, axes = _new(2, 2, (11, 7))
     parts = (("horizontal, m", slice(6, 8), 1.0), ("vertical, m", slice(8, 9), 1.0), ("tilt, deg", slice(0, 2), 57.3))
-    for name, result in results.items():
-        for axis, (title, part, unit) in zip(axes[0], parts, strict=True):
+    for k, (name, result) in enumerate(list(results.items())[:10]):
+        for axis, (title, part, unit) in zip(axes.flat, parts, strict=False):
             size = unit * np.linalg.norm(result["error"][..., part], axis=-1)
             seconds, shifted = _since_sight(size, scene)
             low, middle, high = np.nanquantile(shifted, [0.1, 0.5, 0.9], axis=1)
-            (line,) = axis.plot(seconds, middle, label=name)
-            axis.fill_between(seconds, low, high, color=line.get_color(), alpha=0.1, linewidth=0)
-            axis.set(title=title, yscale="log", xlabel="s since the beacon was first seen")
-    axes[0][0].legend(fontsize=7)
+            axis.plot(seconds, middle, color=f"C{k}", label=name)
+            axis.fill_between(seconds, low, high, color=f"C{k}", alpha=0.06, linewidth=0)
+            axis.set(title=title, yscale="log")
+        away = np.linalg.norm(result["error"][..., 6:9], axis=-1)
+        seconds, shifted = _since_sight(np.where(np.isfinite(away), away, np.inf), scene)
+        axes.flat[3].plot(seconds, np.mean(shifted < 1.0, 1), color=f"C{k}")
+    axes.flat[3].set(title="share of the runs within 1 m")
+    for axis in axes[1]:
+        axis.set_xlabel("s since the beacon was first seen")
+    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     figure.suptitle("Errors at heading zero: median, 10 % to 90 % of the runs")
     figure.savefig(path, dpi=120)
     return path
@@ -90,10 +97,11 @@ def _particles(scene: Scene, path: Path) -> Path:
 
 
 def _paths(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
-    names = list(results)[:6]
-    figure, axes = _new(1, len(names), (3.4 * len(names), 3.6))
+    names = list(results)[:8]
+    rows = 1 + (len(names) > 4)
+    figure, axes = _new(rows, -(-len(names) // rows), (12, 3.4 * rows))
     truth = scene.model.representative(scene.truth)[..., 7:10].numpy()
-    for axis, name in zip(axes[0], names, strict=True):
+    for axis, name in zip(axes.flat, names, strict=False):
         for run in range(min(6, truth.shape[1])):
             first = int(scene.acquired[run])
             axis.plot(*truth[:, run, :2].T, color="0.6", linewidth=2.5)
@@ -102,7 +110,7 @@ def _paths(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
             axis.plot(*position[first:].T, color="C0", linewidth=0.8)
         axis.plot(0, 0, "k+")
         axis.set(title=name, xlim=(-40, 40), ylim=(-40, 40), aspect="equal", xlabel="right, m")
-    axes[0][0].set_ylabel("forward, m")
+        axis.set_ylabel("forward, m")
     figure.suptitle("Pad frame turned to heading zero: truth grey, estimate dotted before the beacon is seen")
     figure.savefig(path, dpi=120)
     return path
