@@ -13,15 +13,16 @@ import torch
 from torch import Tensor
 
 from torchfilt.filters.gaussian import CubatureKalmanFilter, ErrorStateKalmanFilter
+from torchfilt.filters.mixture import GaussianSumFilter
 from torchfilt.filters.particle_methods import (
     BootstrapFilter,
-    LocallyLinearizedParticleFilter,
     RaoBlackwellizedParticleFilter,
     RegularizedParticleFilter,
     ResampleMoveParticleFilter,
 )
 from torchfilt.gaussian import Gaussian
 from torchfilt.kernels import Regularize
+from torchfilt.mixture import InitialMixture, split_gaussian
 from torchfilt.model import StateSpaceModel
 from torchfilt.models.inertial.earth import LocalMetres
 from torchfilt.models.inertial.error_model import (
@@ -45,10 +46,7 @@ from torchfilt.models.inertial.imu import (
 )
 from torchfilt.models.inertial.strapdown import Navigation
 from torchfilt.moments import taylor
-from torchfilt.particles import Particles
-from torchfilt.resampling import never
 from torchfilt.run import Filter
-from torchfilt.types import FilterState
 
 Scenario = Literal["sins-sar", "mems", "heading-unknown", "outliers"]
 SCENARIOS: dict[Scenario, str] = {
@@ -61,8 +59,8 @@ ARC_MINUTE = math.radians(1 / 60)
 IMU_RATE_HZ = 100
 # Purposes of random numbers, keys of the noise source.
 _START, _IMU, _FIX, _OUTLIER = range(4)
-# Members of a bank of Gaussian filters, 10 deg of heading apart.
-_BANK = 36
+# Members of a bank of Gaussian filters, where the heading is unknown 10 deg of it apart; and which error that is.
+_BANK, _HEADING = 36, 2
 """Share of the fixes that are outliers, and how many times their noise is larger."""
 OUTLIER_SHARE, OUTLIER_FACTOR = 0.15, 10.0
 
@@ -195,7 +193,7 @@ def _filters(scene: Scene, settings: InertialSettings) -> dict[str, Callable[[],
         "es-kf-gated": lambda: ErrorStateKalmanFilter(model, gate=0.999),
         "es-kf-open": lambda: ErrorStateKalmanFilter(model, feedback=False),
         "ckf": lambda: CubatureKalmanFilter(model),
-        "bank-36": lambda: LocallyLinearizedParticleFilter(model, _BANK, taylor(), split=1.0, resampler=never()),
+        "bank-36": lambda: _bank(model),
         "sir": lambda: BootstrapFilter(heavy, n),
         "rpf-plain": lambda: RegularizedParticleFilter(heavy, n, Regularize(keep_moments=False)),
         "rpf": lambda: RegularizedParticleFilter(heavy, n),
@@ -234,6 +232,12 @@ DEFAULT: dict[Scenario, tuple[str, ...]] = {
 }
 
 
+def _bank(model: StateSpaceModel) -> GaussianSumFilter:
+    """Gaussians in a row over three deviations of the heading to either side, each an extended Kalman filter."""
+    pieces = InitialMixture(split_gaussian(model.prior(), _BANK, _HEADING))
+    return GaussianSumFilter(StateSpaceModel(pieces, model.transition, model.observation), taylor(), components=_BANK)
+
+
 def make_filter(name: str, scene: Scene, settings: InertialSettings) -> Filter[Any]:
     """The filter called ``name``, one of `FILTERS`, for a scene.
 
@@ -244,22 +248,3 @@ def make_filter(name: str, scene: Scene, settings: InertialSettings) -> Filter[A
     if name not in makers:
         raise ValueError(f"filter must be one of {', '.join(FILTERS)}, got {name!r}")
     return makers[name]()
-
-
-def start_state(name: str, tracker: Filter[Any], scene: Scene, settings: InertialSettings) -> FilterState[Any]:
-    """What a filter of `make_filter` begins with: its prior, or for the bank one Gaussian each 10 deg of heading."""
-    state = tracker.init((scene.truth.shape[1],), settings.seed)
-    if name != "bank-36":
-        return state
-    belief: Particles = state.belief
-    spacing, spread = 2 * math.pi / _BANK, settings.start.attitude_sd_rad[2]
-    offset = (torch.arange(_BANK, dtype=torch.float64) + 0.5) * spacing - math.pi
-    turn = torch.nn.functional.pad(offset.unsqueeze(-1), (2, 12))
-    # Each member takes what of the heading's spread lies between it and its neighbours; alike over a grid of Gaussians.
-    assert belief.scale_tril is not None
-    factor = belief.scale_tril.clone()
-    factor[..., 2, 2] = min(0.6 * spacing, spread)
-    weights = torch.log_softmax(-0.5 * (offset / spread).square(), 0).expand_as(belief.log_weights)
-    return state._replace(
-        belief=Particles(belief.space.retract(belief.x, turn), weights.contiguous(), factor, belief.space)
-    )
