@@ -362,6 +362,20 @@ def test_scores():
     assert torch.autograd.gradcheck(evidence, [part.requires_grad_() for part in parts], atol=1e-6)
 
 
+def test_weights_count_by_their_ratio():
+    """As for the other filters: a step of an optimiser that leaves the simplex changes nothing but the ratio."""
+    weights = torch.nn.Parameter(tensor([0.8, 0.2]))
+    laws = [tf.LinearGaussian(tensor(H), tensor(r)) for _, _, r in SENSORS[:2]]
+    filter = tf.GaussianSumFilter(tf.StateSpaceModel(initial(), law(F, MOTIONS[:1]), tf.MixtureLaw(laws, weights)))
+    ys = tensor(series(3, 1))
+    before = filter(ys).log_likelihood
+    before.sum().backward()
+    assert abs((weights.grad * weights).sum()) < 1e-12 < weights.grad.abs().min()
+    with torch.no_grad():
+        weights *= 3
+    close(filter(ys).log_likelihood, before.detach())
+
+
 def test_scores_through_merging():
     ys = tensor(series(4, 1))
     push = torch.nn.Parameter(tensor(PUSH))

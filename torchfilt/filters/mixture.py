@@ -364,7 +364,8 @@ def _alternatives(model: StateSpaceModel, name: str) -> list[StateSpaceModel]:
 
 
 def _log_chances(law: object, like: Tensor) -> Tensor | None:
-    return _log(law.weights.to(like.dtype)) if isinstance(law, MixtureLaw) else None
+    """Of a mixture's laws; normalised, as `torch.distributions.Categorical` does for the other filters."""
+    return _log((law.weights / law.weights.sum()).to(like.dtype)) if isinstance(law, MixtureLaw) else None
 
 
 def _multiplied(log_weights: Tensor, log_chances: Tensor | None) -> Tensor:
