@@ -112,7 +112,7 @@ def test_pairs_are_merged_in_runnalls_order(count):
 
 
 def test_units_do_not_change_the_order():
-    many, unit = mixture(3, n=7), torch.tensor([1e-6, 1.0, 1e5], dtype=DOUBLE)
+    many, unit = mixture(3, n=7), torch.tensor([1e-10, 1.0, 1e5], dtype=DOUBLE)
     scaled = many._replace(x=many.x * unit, scale_tril=many.scale_tril * unit.unsqueeze(-1))
     found, expected = reduce(scaled, 3), reduce(many, 3)
     close(found.x / unit, expected.x, 1e-11)

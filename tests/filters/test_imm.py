@@ -201,12 +201,15 @@ def test_the_right_model_is_found(truth):
 
 
 def test_a_mode_that_is_not_reached_has_no_weight():
-    """From mode 0 no way leads to mode 1; nor does one lead back."""
+    """From mode 0 no way leads to mode 1; nor does one lead back. It keeps the Gaussian that it has."""
     ys = manoeuvre(4, 10)
     start = tensor([1.0, 0.0])
-    filter = tf.InteractingMultipleModel([model(0), model(1)], torch.eye(2, dtype=DOUBLE), initial_probabilities=start)
+    filter = tf.InteractingMultipleModel(
+        [model(0), model(1, M0 + 1, 2 * P0)], torch.eye(2, dtype=DOUBLE), initial_probabilities=start
+    )
     ours = filter(tensor(ys), record="beliefs")
     assert (ours.beliefs.weights[..., 1] == 0).all() and torch.isfinite(ours.beliefs.x).all()
+    close(ours.beliefs.x[:, :, 1], tf.KalmanFilter(model(1, M0 + 1, 2 * P0))(tensor(ys)).mean, 1e-11)
     close(ours.mean, tf.KalmanFilter(model(0))(tensor(ys)).mean, 1e-12)
     close(ours.log_likelihood, tf.KalmanFilter(model(0))(tensor(ys)).log_likelihood, 1e-11)
 
