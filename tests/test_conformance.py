@@ -18,7 +18,7 @@ from torchfilt.io.starry_night import Camera
 from torchfilt.kernels import Regularize
 from torchfilt.missions.attitude import stars
 from torchfilt.models import landing, relative_motion
-from torchfilt.models.attitude import ATTITUDE_SPACE, GyroTransition, VectorMeasurement
+from torchfilt.models.attitude import ATTITUDE_SPACE, GyroTransition, VectorMeasurement, kinematics
 from torchfilt.models.inertial import error_model, navigation
 from torchfilt.models.inertial.earth import LocalMetres
 from torchfilt.models.inertial.error_model import InertialErrorFixes, InertialErrorTransition
@@ -74,6 +74,11 @@ SINS = error_model.sins_inputs(
     FLOWN.dvelocity_m_s.unsqueeze(1),
     0.01,
 ).u[0]
+HOVER = normal(4, 16, seed=20) * torch.tensor([0.3] * 3 + [1.0] + [2.0] * 6 + [0.01] * 6, dtype=DOUBLE)
+HOVER = torch.cat(
+    [torch.nn.functional.normalize(HOVER[:, :4], dim=-1), HOVER[:, 4:9], HOVER[:, 9:10].abs() + 8, HOVER[:, 10:]], -1
+)
+HOVER_PUSH = torch.cat([normal(3, seed=28, scale=0.02), torch.tensor([0.0, 0.0, 0.245], dtype=DOUBLE)])
 STATES = navigation.NAVIGATION_SPACE.retract(
     navigation.navigation_state(Navigation(*(part[0] for part in FLOWN.navigation)), ORIGIN),
     normal(5, 15, seed=15) * torch.tensor([0.1, 1.0, 100.0, 1e-3, 1e-2], dtype=DOUBLE).repeat_interleave(3),
@@ -181,6 +186,10 @@ LAWS = {
     ),
     "VectorMeasurement": (VectorMeasurement(normal(3, seed=24), 0.2), ATTITUDES, None, None),
     "VectorMeasurement of a navigation state": (VectorMeasurement(normal(3, seed=24), 0.2), STATES, None, None),
+    "LandingTransition": (landing.LandingTransition(3e-4, 0.01), HOVER, HOVER_PUSH, 0.025),
+    "LandingTransition walks": (landing.LandingTransition(3e-4, 0.01, 1e-5, 1e-3), HOVER, HOVER_PUSH, 0.025),
+    "Barometer": (landing.Barometer(0.4), HOVER, None, None),
+    "Beacon": (landing.Beacon(0.007), HOVER, None, None),
     "PoseTransition": (
         stars.PoseTransition(*normal(2, 3, seed=27).exp()),
         POSES,
@@ -256,7 +265,7 @@ def test_every_law_is_registered():
     laws = {type(law).__name__ for law, *_ in LAWS.values()}
     shipped = {
         name
-        for module in (tf.laws, tf.sensors, relative_motion, error_model, navigation, stars, tf.gp)
+        for module in (tf.laws, tf.sensors, relative_motion, error_model, navigation, kinematics, landing, stars, tf.gp)
         for name, member in inspect.getmembers(module, inspect.isclass)
         if issubclass(member, nn.Module)
         and inspect.signature(member.forward).return_annotation in (tf.Gaussian, "Gaussian")
@@ -550,10 +559,6 @@ def test_filters_in_a_gauge(name, own):
 
 
 PLANE = torch.tensor([[1.0, 2.0, 0.5], [-3.0, 1.0, -2.5], [0.3, -4.0, 3.0]], dtype=DOUBLE)
-HOVER = normal(4, 16, seed=20) * torch.tensor([0.3] * 3 + [1.0] + [2.0] * 6 + [0.01] * 6, dtype=DOUBLE)
-HOVER = torch.cat(
-    [torch.nn.functional.normalize(HOVER[:, :4], dim=-1), HOVER[:, 4:9], HOVER[:, 9:10].abs() + 8, HOVER[:, 10:]], -1
-)
 SYMMETRIES = {
     "plane": (
         symmetry_problem.model(symmetry_problem.NoseEast(), symmetry_problem.camera(0.1)),
