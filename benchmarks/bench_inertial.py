@@ -63,7 +63,6 @@ from _harness import Row
 from torch import Tensor
 
 from torchfilt.missions.inertial import FILTERS, InertialSettings, Scene, make_filter, make_scene
-from torchfilt.missions.inertial.scene import start_state
 from torchfilt.noise import NoiseSource
 from torchfilt.run import Filter
 
@@ -218,7 +217,7 @@ def run_others(scene: Scene, settings: InertialSettings, rounds: int) -> tuple[s
     rows = {}
     for name in FILTERS:
         filter_ = make_filter(name, scene, settings)
-        state = start_state(name, filter_, scene, settings)
+        state = filter_.init((settings.runs,), settings.seed)
         rows[name] = Row(
             lambda f=filter_, s=state: (
                 f(scene.fixes, scene.controls, dt=1.0, state=s, record="mean", throw=False).log_likelihood

@@ -872,6 +872,9 @@ class BrokenSpace(Euclidean):
     def carry(self, v, columns):
         return columns + v.unsqueeze(-1) if self.defect == "curved" else columns
 
+    def carry_back(self, v, columns):
+        return columns + v.unsqueeze(-1) if self.defect == "one way" else columns
+
     def observed(self, y):
         return torch.ones_like(y, dtype=torch.bool) if self.defect == "sees all" else super().observed(y)
 
@@ -882,6 +885,7 @@ class BrokenSpace(Euclidean):
         ("sign", "local"),
         ("scale", "is v"),
         ("curved", "change of chart"),
+        ("one way", "undoes carry"),
         ("mixes rows", "beside a row of NaN"),
         ("unweighted", "sum to zero"),
         ("sees all", "nothing is observed"),

@@ -318,3 +318,25 @@ def test_xarray(name, pattern):
         assert data["innovation_scale_tril"].dims == (*shared, "measurement", "measurement_2")
     if name == "bootstrap":
         assert data["ancestors"].dims == ("time", "batch_0", "particle")
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+def test_xarray_of_what_gates_decide(batch):
+    """One entry a sensor where sensors have names, none where they have not; starts over have no tail."""
+    pytest.importorskip("xarray")
+    eye = torch.eye(1, dtype=torch.float64)
+    laws = {"near": tf.LinearGaussian(eye, eye), "far": tf.LinearGaussian(eye, 4 * eye)}
+    prior, motion = tf.Gaussian(torch.zeros(1, dtype=torch.float64), eye), tf.LinearGaussian(eye, eye)
+    named, plain = (tf.StateSpaceModel(prior, motion, law) for law in (tf.Sensors(laws), laws["near"]))
+    ys = torch.zeros(4, *batch, 2, dtype=torch.float64)
+    ys[2, ..., 0] = 1e3
+    dims = ("time", *(f"batch_{k}" for k in range(len(batch))))
+    history = tf.Reacquire(tf.GaussianFilter(named, tf.moments.taylor(), gate=0.99), "near", 0.1)(ys, dt=0.1)
+    data = history.to_xarray()
+    assert data["accepted"].dims == data["gate_nis"].dims == (*dims, "sensor")
+    assert data["restarted"].dims == dims
+    np.testing.assert_array_equal(data["accepted"].isel(sensor=0), history.diagnostics.accepted[..., 0].numpy())
+    assert not data["accepted"].isel(time=2, sensor=0).any() and data["accepted"].isel(sensor=1).all()
+    assert bool(data["restarted"].isel(time=2).all())
+    single = tf.GaussianFilter(plain, tf.moments.taylor(), gate=0.99)(ys[..., :1]).to_xarray()
+    assert single["accepted"].dims == dims and not single["accepted"].isel(time=2).any()

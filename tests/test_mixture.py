@@ -78,7 +78,7 @@ def test_a_factor_that_all_share():
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_on_rotations_the_mean_is_intrinsic_and_covariances_are_seen_from_it(side):
-    """A component's columns are turned by the Jacobian of the way from its centre to the mean."""
+    """A component's columns are turned by the inverse Jacobian of the way from the mean to its centre."""
     rng = np.random.default_rng(2)
     points = Rotation.from_rotvec(0.5 * rng.standard_normal((5, 3)))
     weights = rng.dirichlet(np.ones(5))
@@ -92,8 +92,8 @@ def test_on_rotations_the_mean_is_intrinsic_and_covariances_are_seen_from_it(sid
     errors = ((mean.inv() * points) if side == "right" else (points * mean.inv())).as_rotvec()
     covariance = np.zeros((3, 3))
     for w, error, factor in zip(weights, errors, factors, strict=True):
-        # From the centre the way to the mean is -error; on the left the Jacobian is that of the opposite turn.
-        own = mixture_oracle.right_jacobian(-error if side == "right" else error) @ factor
+        # mean exp(error) exp(d) = mean exp(error + J^-1 d); on the left J is that of the opposite turn.
+        own = np.linalg.solve(mixture_oracle.right_jacobian(error if side == "right" else -error), factor)
         covariance += w * (np.outer(error, error) + own @ own.T)
     close(one.covariance, covariance)
 

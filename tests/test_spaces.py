@@ -430,6 +430,9 @@ def test_errors_seen_from_another_point(space, draw, turn, dtype):
     # 1 - cos a and a - sin a lose what a is below a turn: 1e3 roundings at most.
     limit = 1e3 * torch.finfo(dtype).eps
     torch.testing.assert_close(carried.double(), exact @ columns, rtol=0, atol=limit)
+    back = space.carry_back(v.to(dtype), columns.to(dtype))
+    assert back.dtype == dtype
+    torch.testing.assert_close(back.double(), torch.linalg.solve(exact, columns), rtol=0, atol=limit)
 
 
 @spaces

@@ -73,7 +73,9 @@ class History:
         }
         variables = {}
         for name, array in self.to_numpy().items():
-            tail = tails.get(name, [])
+            # A gate reports one entry a sensor where the measurement law names its sensors.
+            by_sensor = name in ("accepted", "gate_nis") and array.ndim == self.mean.dim()
+            tail = ["sensor"] if by_sensor else tails.get(name, [])
             shared = array.ndim == 1 + len(tail)
             variables[name] = (["time", *([] if shared else batch), *tail], array)
         return xarray.Dataset(variables, attrs={"evidence": self.evidence})

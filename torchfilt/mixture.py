@@ -36,7 +36,7 @@ def merge(mixture: Particles) -> Gaussian:
     factor, space, weights = factors_of(mixture), mixture.space, mixture.weights
     mean, errors = centred(space, mixture.x, weights)
     root = _root(weights).unsqueeze(-1)
-    own = space.carry(-errors, factor).expand(*errors.shape, -1) * root.unsqueeze(-1)
+    own = space.carry_back(errors, factor).expand(*errors.shape, -1) * root.unsqueeze(-1)
     columns = torch.cat([(errors * root).mT, own.movedim(-3, -2).flatten(-2)], -1)
     return Gaussian(mean, triangularize(columns), space)
 
@@ -118,7 +118,7 @@ def _bound(one: _Ranked, other: _Ranked, space: Space, scale: Tensor) -> Tensor:
     apart = space.local(one.x, other.x)
     whole = one.weights + other.weights
     share = torch.where(whole > 0, other.weights / torch.where(whole > 0, whole, 1), 0.5)
-    scaled = (factor / scale.unsqueeze(-1) for factor in (one.factor, space.carry(-apart, other.factor)))
+    scaled = (factor / scale.unsqueeze(-1) for factor in (one.factor, space.carry_back(apart, other.factor)))
     own, theirs = (factor @ factor.mT for factor in scaled)
     apart = apart / scale
     between = (share * (1 - share))[..., None, None] * apart.unsqueeze(-1) * apart.unsqueeze(-2)

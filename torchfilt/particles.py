@@ -109,7 +109,7 @@ class Particles(NamedTuple):
     def _local_covariance(self, errors: Tensor, weights: Tensor) -> Tensor:
         """Mean of the particles' own covariances, each seen from the mean of all."""
         assert self.scale_tril is not None
-        factor = self.space.carry(-errors, self.scale_tril)
+        factor = self.space.carry_back(errors, self.scale_tril)
         own = factor @ factor.mT
         if own.shape[-3] == 1:
             return own.squeeze(-3)

@@ -265,7 +265,7 @@ class Local:
         apart = space.local(mean.unsqueeze(-2), particles.x)
         # Cloud's covariance by one triangularisation of its columns, so that nothing is squared.
         root = weights.sqrt().unsqueeze(-1)
-        factor = space.carry(-apart, particles.scale_tril)
+        factor = space.carry_back(apart, particles.scale_tril)
         own = factor if factor.shape[-3] == 1 else factor * root.unsqueeze(-1)
         columns = torch.cat([(apart * root).mT, own.movedim(-3, -2).flatten(-2)], -1)
         whole = steady_triangularize(columns)

@@ -131,6 +131,21 @@ def turned_by_jacobian(v: Vector, error: Vector) -> Vector:
     angle = angle2.sqrt()
     first = torch.where(small, _series(square, _COSINE), 2 * (0.5 * angle).sin().square() / angle2)
     second = torch.where(small, _series(square, _SINE), (angle - angle.sin()) / (angle2 * angle))
+    return _second_order(v, error, first, second)
+
+
+def turned_by_inverse_jacobian(v: Vector, error: Vector) -> Vector:
+    """The inverse of `turned_by_jacobian`, for v shorter than a turn: I - [v] / 2 + (1 - a/2 cot a/2) / a^2 [v]^2."""
+    square = _square(v)
+    small = square < 1e-2
+    angle2 = torch.where(small, 1, square)
+    half = 0.5 * angle2.sqrt()
+    second = torch.where(small, _series(square, _COTANGENT), (1 - half * half.cos() / half.sin()) / angle2)
+    return _second_order(v, error, torch.full_like(second, -0.5), second)
+
+
+def _second_order(v: Vector, error: Vector, first: Tensor, second: Tensor) -> Vector:
+    """Error + first v x error + second v x (v x error)."""
     once = cross(v, error)
     twice = cross(v, once)
     x, y, z = (torch.addcmul(torch.addcmul(e, first, o), second, t) for e, o, t in zip(error, once, twice, strict=True))
@@ -140,6 +155,9 @@ def turned_by_jacobian(v: Vector, error: Vector) -> Vector:
 # (1 - cos a) / a^2 and (a - sin a) / a^3 in powers of a^2: what is left out below 0.01 is less than rounding.
 _COSINE = (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600)
 _SINE = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800)
+
+# (1 - a/2 cot a/2) / a^2 in the same way.
+_COTANGENT = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000)
 
 
 def _series(x: Tensor, coefficients: Sequence[float]) -> Tensor:

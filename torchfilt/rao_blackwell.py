@@ -1,6 +1,6 @@
 """Rao-Blackwellised particles: some components are drawn, the others stay a Gaussian in each particle."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import NamedTuple
@@ -275,11 +275,18 @@ class _Section(NamedTuple):
 
     def carry(self, v: Tensor, columns: Tensor) -> Tensor:
         """As the whole space; where the linear components are flat nothing needs a particle axis."""
+        return columns if self._is_flat() else self._of_whole(self.space.carry, v, columns)
+
+    def carry_back(self, v: Tensor, columns: Tensor) -> Tensor:
+        """As the whole space."""
+        return columns if self._is_flat() else self._of_whole(self.space.carry_back, v, columns)
+
+    def _is_flat(self) -> bool:
         curved = curved_components(self.space, len(self.parts.linear) + len(self.parts.drawn))
-        if not set(curved) & set(self.parts.linear):
-            return columns
-        whole = self.space.carry(self.parts.spread(v, -1), self.parts.spread(columns, -2))
-        return self.parts.take(whole, -2)
+        return not set(curved) & set(self.parts.linear)
+
+    def _of_whole(self, rule: Callable[[Tensor, Tensor], Tensor], v: Tensor, columns: Tensor) -> Tensor:
+        return self.parts.take(rule(self.parts.spread(v, -1), self.parts.spread(columns, -2)), -2)
 
     def observed(self, y: Tensor) -> Tensor:
         """Linear components that are there."""

@@ -5,7 +5,7 @@ A space turns a tangent vector (the error, e numbers) into a point (d numbers) a
 (sampling, densities, innovations, means, covariances) follows from the two.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -14,12 +14,14 @@ from torch import Tensor
 
 from torchfilt.linalg import is_differentiated
 from torchfilt.quaternions import (
+    Vector,
     conjugate,
     exponential,
     logarithm,
     product,
     quaternion,
     stack,
+    turned_by_inverse_jacobian,
     turned_by_jacobian,
     vector,
 )
@@ -60,6 +62,10 @@ class Space(Protocol):
 
         The derivative of ``local(retract(x, v), retract(x, v + error))`` by the error, wherever x is.
         """
+        ...
+
+    def carry_back(self, v: Tensor, columns: Tensor) -> Tensor:
+        """Small errors (..., e, k) about ``retract(x, v)`` as errors about v in the chart of x: undoes `carry`."""
         ...
 
     def observed(self, y: Tensor) -> Tensor:
@@ -164,6 +170,10 @@ class Euclidean:
         """The columns themselves."""
         return columns
 
+    def carry_back(self, v: Tensor, columns: Tensor) -> Tensor:
+        """The columns themselves."""
+        return columns
+
     def observed(self, y: Tensor) -> Tensor:
         """Each number on its own."""
         return ~torch.isnan(y)
@@ -222,6 +232,10 @@ class Angle:
         return _intrinsic_mean(self, points, weights, start)
 
     def carry(self, v: Tensor, columns: Tensor) -> Tensor:
+        """The columns themselves."""
+        return columns
+
+    def carry_back(self, v: Tensor, columns: Tensor) -> Tensor:
         """The columns themselves."""
         return columns
 
@@ -300,9 +314,15 @@ class UnitQuaternion:
         Source: Mueller, Hehn, D'Andrea, Covariance correction step for Kalman filtering with an attitude, JGCD 40
             (2017), which takes its first two terms.
         """
+        return self._turned(turned_by_jacobian, v, columns)
+
+    def carry_back(self, v: Tensor, columns: Tensor) -> Tensor:
+        """Columns times the inverse of that Jacobian; for v shorter than a turn."""
+        return self._turned(turned_by_inverse_jacobian, v, columns)
+
+    def _turned(self, by: Callable[[Vector, Vector], Vector], v: Tensor, columns: Tensor) -> Tensor:
         backward = v if self.side == "left" else -v
-        parts = turned_by_jacobian(vector(backward.unsqueeze(-1).unbind(-2)), vector(columns.unbind(-2)))
-        return stack(parts).mT
+        return stack(by(vector(backward.unsqueeze(-1).unbind(-2)), vector(columns.unbind(-2)))).mT
 
     def observed(self, y: Tensor) -> Tensor:
         """All of it or nothing."""
@@ -369,9 +389,16 @@ class Product:
 
     def carry(self, v: Tensor, columns: Tensor) -> Tensor:
         """Each part's rows by its own rule."""
+        return self._by_parts([space.carry for space in self.spaces], v, columns)
+
+    def carry_back(self, v: Tensor, columns: Tensor) -> Tensor:
+        """Each part's rows by its own rule."""
+        return self._by_parts([space.carry_back for space in self.spaces], v, columns)
+
+    def _by_parts(self, rules: list[Callable[[Tensor, Tensor], Tensor]], v: Tensor, columns: Tensor) -> Tensor:
         rows = columns.split(self._tangent_sizes, -2)
-        parts = zip(self.spaces, v.split(self._tangent_sizes, -1), rows, strict=True)
-        carried = [space.carry(step, part) for space, step, part in parts]
+        parts = zip(rules, v.split(self._tangent_sizes, -1), rows, strict=True)
+        carried = [rule(step, part) for rule, step, part in parts]
         if all(after is before for after, before in zip(carried, rows, strict=True)):
             return columns
         lead = torch.broadcast_shapes(*(part.shape[:-2] for part in carried))

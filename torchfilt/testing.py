@@ -802,6 +802,8 @@ def _check_space_carry(name: str, space: Space, points: Tensor, steps: Tensor, l
     )(identity)
     carried = space.carry(steps, identity).expand(*steps.shape, -1)
     _near(f"{name}: carry is the derivative of the change of chart", carried, columns.movedim(0, -1), limit)
+    back = space.carry_back(steps, space.carry(steps, identity)).expand(*steps.shape, -1)
+    _near(f"{name}: carry_back undoes carry", back, identity.expand(*steps.shape, -1), limit)
 
 
 def _check_space_rows(name: str, space: Space, points: Tensor, steps: Tensor, limit: float) -> None:

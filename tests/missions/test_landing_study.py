@@ -8,8 +8,10 @@ import pytest
 import run_landing
 import torch
 
+import torchfilt as tf
 from torchfilt.missions.landing import study
 from torchfilt.missions.landing.scene import SCENARIOS, LandingSettings, make_scene
+from torchfilt.models.attitude import multiply
 
 SHORT = LandingSettings(runs=2, duration_s=18.0)
 
@@ -57,6 +59,38 @@ def test_numbers_of_made_up_errors():
     assert found["horizontal_m"] == [0.0, 40.0] and found["vertical_m"] == [0.5, 0.5]
     np.testing.assert_allclose(found["attitude_deg"], [3.0, 3.0])
     assert found["nees"] == 2.0 and found["restarts"] == 1 and found["failed"] == 0 and found["ms_per_step"] == 250.0
+
+
+def test_a_turned_belief_is_as_consistent():
+    """Mean and covariance turned about the vertical together: the same error and the same NEES, of one row by hand."""
+    scene = make_scene(LandingSettings(runs=1, duration_s=11.0))
+    generator = torch.Generator().manual_seed(0)
+    factor = torch.randn(15, 15, generator=generator, dtype=torch.float64).tril() * 0.1
+    prior = scene.model.prior()
+    mean = scene.model.representative(scene.truth[100])
+    truth = scene.model.representative(prior.space.retract(mean, 0.05 * torch.ones(1, 15, dtype=torch.float64)))
+    angle = 1.1
+    c, s = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    blocks = torch.block_diag(turn, turn, turn, torch.eye(6, dtype=torch.float64))
+    about_z = torch.tensor([0, 0, math.sin(angle / 2), math.cos(angle / 2)], dtype=torch.float64)
+    parts = [multiply(about_z, mean[:, :4]), mean[:, 4:7] @ turn.mT, mean[:, 7:10] @ turn.mT, mean[:, 10:]]
+    beliefs = (
+        tf.Gaussian(mean, factor, prior.space),
+        tf.Gaussian(torch.cat(parts, -1), blocks @ factor, prior.space),
+    )
+    (at, error, nees), (as_at, as_error, as_nees) = (study.compare(scene, belief, truth) for belief in beliefs)
+    torch.testing.assert_close(as_at, at, rtol=0, atol=1e-12)
+    torch.testing.assert_close(as_error, error, rtol=0, atol=1e-12)
+    # Conditioned like a random triangular factor of 15 numbers.
+    torch.testing.assert_close(as_nees, nees, rtol=1e-8, atol=0)
+    # A level belief without a turn of its own loses the heading and keeps the rest.
+    level = scene.model.prior().mean.unsqueeze(0)
+    near = prior.space.retract(level, 0.05 * (torch.arange(15) != 2).to(level).unsqueeze(0))
+    spread = torch.linspace(0.1, 1.5, 15, dtype=torch.float64)
+    error, nees = study.compare(scene, tf.Gaussian(level, spread, prior.space, True), near)[1:]
+    expected = sum(float(e / d) ** 2 for k, (e, d) in enumerate(zip(error[0], spread, strict=True)) if k != 2)
+    assert nees.item() == pytest.approx(expected, rel=1e-12)
 
 
 def test_every_filter_can_be_made():

@@ -12,16 +12,19 @@ from torch import Tensor
 from torchfilt.filters.gaussian import ErrorStateKalmanFilter, GaussianFilter, UnscentedKalmanFilter
 from torchfilt.filters.particle_methods import BootstrapFilter, LocallyLinearizedParticleFilter
 from torchfilt.gates import Gate
+from torchfilt.gaussian import Gaussian
 from torchfilt.missions.landing.scene import SCENARIOS, LandingSettings, Scene, make_scene
 from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
 from torchfilt.model import StateSpaceModel
 from torchfilt.moments import taylor
+from torchfilt.particles import Particles
 from torchfilt.robust import Reacquire
 from torchfilt.run import Filter
+from torchfilt.symmetry import gauge_first_order
 from torchfilt.types import trusted
 
 # Results of another version of the arithmetic are not reused: raise this with it.
-_VERSION = 1
+_VERSION = 2
 # A run has converged where it is within both, as far after the beacon was first seen.
 CONVERGED_M, CONVERGED_RAD, AFTER_S = 1.0, np.radians(5.0), 10.0
 _PASS, _PATIENCE_S, _REFUSED_SHARE = 0.9999, 0.5, 0.02
@@ -93,7 +96,6 @@ def run_filter(name: str, scene: Scene, seed: int, progress: bool = False) -> Ar
 
     tracker, runs = make_filter(name, scene), scene.truth.shape[1]
     state = tracker.init((runs,), seed)
-    space = scene.model.prior().space
     truth = scene.model.representative(scene.truth)
     rows: dict[str, list[Tensor]] = {}
     restarts = torch.zeros(runs)
@@ -102,12 +104,10 @@ def run_filter(name: str, scene: Scene, seed: int, progress: bool = False) -> Ar
         with torch.no_grad():
             state, info = tracker.step(state, scene.measurements[k], scene.controls[k], scene.dt, throw=False)
             seconds = time.process_time() - begin
-            belief = trusted(state.belief)
-            mean = scene.model.representative(belief.mean)
-            error = space.local(mean, truth[k])
+            mean, error, nees = compare(scene, trusted(state.belief), truth[k])
             step = {
                 "error": error,
-                "nees": _nees(error, belief.covariance),
+                "nees": nees,
                 "ok": info.ok,
                 "position": mean[..., 7:10],
                 "cpu_s": torch.tensor(seconds),
@@ -117,6 +117,21 @@ def run_filter(name: str, scene: Scene, seed: int, progress: bool = False) -> Ar
         for key, value in step.items():
             rows.setdefault(key, []).append(value)
     return {key: torch.stack(values).numpy() for key, values in rows.items()} | {"restarts": restarts.numpy()}
+
+
+def compare(scene: Scene, belief: Gaussian | Particles, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean (R, d) of a belief at heading zero, error (R, e) from there to the truth, NEES (R,) without the heading.
+
+    The covariance is turned along with the mean: a filter that keeps a heading states it in axes of its own.
+
+    Args:
+        scene: of the runs. belief: of any filter. truth: (R, d) at heading zero.
+    """
+    gauge = scene.model.gauge
+    assert gauge is not None
+    mean, turn = gauge_first_order(gauge, belief.mean, belief.space)
+    error = belief.space.local(mean, truth)
+    return mean, error, _nees(error, turn @ belief.covariance @ turn.mT)
 
 
 def _nees(error: Tensor, covariance: Tensor) -> Tensor:
