@@ -1,0 +1,27 @@
+"""Linear systems and their design: state space, discretisation, observers, Riccati equations."""
+
+from torchfilt.models.control.systems import (
+    Discretized,
+    StateSpace,
+    as_system,
+    c2d,
+    eig,
+    hold_input,
+    integrate_noise,
+    pinv,
+    poles,
+    ss,
+)
+
+__all__ = [
+    "Discretized",
+    "StateSpace",
+    "as_system",
+    "c2d",
+    "eig",
+    "hold_input",
+    "integrate_noise",
+    "pinv",
+    "poles",
+    "ss",
+]
