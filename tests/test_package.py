@@ -60,7 +60,7 @@ LAYERS = [
     ["proposals", "moves", "models"],
     ["run", "rao_blackwell"],
     ["filters"],
-    ["smoothing", "robust", "metrics"],
+    ["smoothing", "robust", "delays", "metrics"],
     ["learning", "report", "io", "testing"],
     ["missions"],
 ]

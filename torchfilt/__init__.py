@@ -1,6 +1,7 @@
 """Probabilistic filtering in PyTorch: one state-space model, any filter, gradients through everything."""
 
-from torchfilt import kernels, mixture, moments, moves, proposals, rao_blackwell, resampling, spaces
+from torchfilt import delays, kernels, mixture, moments, moves, proposals, rao_blackwell, resampling, spaces
+from torchfilt.delays import DelayedMeasurements
 from torchfilt.filters import (
     AuxiliaryParticleFilter,
     BootstrapFilter,
@@ -47,6 +48,7 @@ __all__ = [
     "AuxiliaryParticleFilter",
     "BootstrapFilter",
     "CubatureKalmanFilter",
+    "DelayedMeasurements",
     "ErrorStateKalmanFilter",
     "Euclidean",
     "ExtendedKalmanFilter",
@@ -81,6 +83,7 @@ __all__ = [
     "UnitQuaternion",
     "UnscentedKalmanFilter",
     "UnscentedParticleFilter",
+    "delays",
     "gp",
     "io",
     "kernels",
