@@ -10,7 +10,9 @@ from torchfilt.models.control.systems import (
     integrate_noise,
     pinv,
     poles,
+    pzmap,
     ss,
+    zeros,
 )
 
 __all__ = [
@@ -23,5 +25,7 @@ __all__ = [
     "integrate_noise",
     "pinv",
     "poles",
+    "pzmap",
     "ss",
+    "zeros",
 ]

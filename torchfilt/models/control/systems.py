@@ -3,10 +3,14 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchfilt.linalg import psd_factor
+
+Array = NDArray[np.float64]
 
 _TRACED_DOUBLINGS = 20
 """How often a traced `integrate_noise` may double its step: right up to ‖A‖ dt of a million."""
@@ -116,8 +120,8 @@ def as_system(value: Any) -> StateSpace:
         return value
     if not all(hasattr(value, name) for name in ("A", "B", "C", "D", "dt")):
         raise TypeError(f"a system must be a StateSpace or a control.StateSpace, got {type(value).__name__}")
-    matrices = [torch.tensor(getattr(value, name), dtype=torch.float64) for name in "ABCD"]
-    return StateSpace(*matrices, _period(value.dt))
+    a, b, c, d = (torch.tensor(getattr(value, name), dtype=torch.float64) for name in "ABCD")
+    return StateSpace(a, b, c, d, _period(value.dt))
 
 
 # Poles and zeros ------------------------------------------------------------------------------------------------------
@@ -129,14 +133,77 @@ def eig(a: Tensor) -> Tensor:
 
 
 def pinv(a: Tensor) -> Tensor:
-    """Moore-Penrose inverse (*batch, n, m) of a (*batch, m, n); singular values below eps max(m, n) of the largest
-    count as zero."""
+    """Moore-Penrose inverse (*batch, n, m) of a (*batch, m, n).
+
+    Singular values below eps max(m, n) of the largest count as zero.
+    """
     return torch.linalg.pinv(a)
 
 
 def poles(system: Any) -> Tensor:
     """Poles (*batch, d), complex, in no particular order: eigenvalues of A, with those that the input cannot move."""
     return eig(as_system(system).a)
+
+
+def zeros(system: Any) -> Tensor:
+    """Invariant zeros (z,), complex: where the pencil [[A - s I, B], [C, D]] loses rank.
+
+    Of a system that is controllable and observable they are the transmission zeros. Infinite zeros are taken out first
+    by orthogonal reductions, so that only finite ones reach the generalised eigenvalue problem; any number of inputs
+    and outputs will do.
+
+    Raises:
+        ValueError: the system is a batch, whose rows may have different numbers of zeros.
+
+    Source: Emami-Naeini and Van Dooren, Computation of zeros of linear multivariable systems, Automatica 18 (1982).
+    """
+    plant = as_system(system)
+    _refuse_batch(plant, "zeros")
+    from scipy.linalg import eigvals
+
+    a, b, c, d = (matrix.detach().cpu().double().numpy() for matrix in plant._matrices().values())
+    pencil = np.block([[a, b], [c, d]])
+    tolerance = 10 * max(pencil.shape) * torch.finfo(plant.a.dtype).eps * float(np.linalg.norm(pencil))
+    a, b, c, d = _without_infinite_zeros(a, b, c, d, tolerance)
+    a, c, b, d = (matrix.T for matrix in _without_infinite_zeros(a.T, c.T, b.T, d.T, tolerance))
+    # What is left of D is square and regular: on the null space of [C D] only A - s I remains.
+    states = len(a)
+    kernel = np.linalg.svd(np.hstack([c, d]))[2][len(c) :].T
+    found = eigvals(np.hstack([a, b]) @ kernel, kernel[:states]) if states else np.zeros(0)
+    kind = torch.complex64 if plant.a.dtype == torch.float32 else torch.complex128
+    return torch.as_tensor(found).to(dtype=kind, device=plant.a.device)
+
+
+def pzmap(system: Any, axes: Any = None) -> Any:
+    """Poles (crosses) and zeros (circles) in the complex plane with the boundary of stability.
+
+    The boundary is the imaginary axis, in discrete time the unit circle.
+
+    Args:
+        system: one system, no batch. axes: where to draw, default axes of a new figure.
+
+    Returns:
+        The matplotlib axes.
+    """
+    plant = as_system(system)
+    marks = {"poles": ("x", poles(plant)), "zeros": ("o", zeros(plant))}
+    from matplotlib.figure import Figure
+
+    axes = Figure(layout="constrained").add_subplot() if axes is None else axes
+    boundary = {"color": "0.6", "linewidth": 1.0, "label": "boundary of stability"}
+    if plant.is_discrete:
+        angle = np.linspace(0, 2 * np.pi, 361)
+        axes.plot(np.cos(angle), np.sin(angle), **boundary)
+        axes.set_aspect("equal", adjustable="datalim")
+    else:
+        axes.axvline(0.0, **boundary)
+    for label, (marker, values) in marks.items():
+        points = values.detach().cpu()
+        axes.plot(points.real, points.imag, marker, fillstyle="none", label=label)
+    axes.set_xlabel("real part" if plant.is_discrete else "real part (1/s)")
+    axes.set_ylabel("imaginary part" if plant.is_discrete else "imaginary part (1/s)")
+    axes.legend()
+    return axes
 
 
 # Discretisation -------------------------------------------------------------------------------------------------------
@@ -259,6 +326,24 @@ def state_noise(a: Tensor, noise: Tensor, noise_input: Tensor | None, name: str)
 
 
 # Parts ----------------------------------------------------------------------------------------------------------------
+
+
+def _without_infinite_zeros(a: Array, b: Array, c: Array, d: Array, tolerance: float) -> tuple[Array, ...]:
+    """A smaller system with the same finite zeros, whose D has full row rank."""
+    while True:
+        left, values, _ = np.linalg.svd(d)
+        rank = int((values > tolerance).sum())
+        c, d = left.T @ c, (left.T @ d)[:rank]
+        # Outputs that no input reaches at once must be zero: the state stays where they are.
+        _, values, right = np.linalg.svd(c[rank:])
+        bound = int((values > tolerance).sum())
+        if bound == 0:
+            return a, b, c[:rank], d
+        basis = np.vstack([right[bound:], right[:bound]]).T
+        a, b, c = basis.T @ a @ basis, basis.T @ b, c[:rank] @ basis
+        free = len(a) - bound
+        c, d = np.vstack([c[:, :free], a[free:, :free]]), np.vstack([d, b[free:]])
+        a, b = a[:free, :free], b[:free]
 
 
 def _size(matrix: Tensor) -> Tensor:
