@@ -9,7 +9,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import torchfilt as tf
-from torchfilt.models.control.continuous import ContinuousLinear, ContinuousTransition, noise_factor, zero_order_hold
+from torchfilt.models.control import c2d, ss
+from torchfilt.models.control.continuous import ContinuousLinear, ContinuousTransition, noise_factor
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
 from torchfilt.testing import check_filter, check_law
 
@@ -31,9 +32,9 @@ def oracle_noise(a, gqg, dt):
     """The covariance's own ODE, by Kronecker products: exact for linear systems, no torchfilt."""
     d = len(a)
     big = np.zeros((d * d + 1, d * d + 1))
-    big[:-1, :-1] = np.kron(a, np.eye(d)) + np.kron(np.eye(d), a)
-    big[:-1, -1] = gqg.reshape(-1)
-    return expm(big * dt)[:-1, -1].reshape(d, d)
+    big[:-1, :-1] = dt * (np.kron(a, np.eye(d)) + np.kron(np.eye(d), a))
+    big[:-1, -1] = gqg.reshape(-1)  # per unit of dt: expm's error is relative to its largest entry, one
+    return dt * expm(big)[:-1, -1].reshape(d, d)
 
 
 # Linear -------------------------------------------------------------------------------------------------------------
@@ -68,6 +69,16 @@ def test_stiff_systems_do_not_overflow(rate):
     """Ornstein-Uhlenbeck: variance q (1 - exp(-2 r dt)) / (2 r); the block exponential holds exp(+r dt) at 1000."""
     factor = noise_factor(double([[-rate]]), torch.ones(1, 1, dtype=DOUBLE), double(1.0))
     torch.testing.assert_close(factor.square(), double([[-math.expm1(-2 * rate) / (2 * rate)]]), rtol=1e-12, atol=0)
+
+
+def test_the_factor_and_van_loans_covariance_agree():
+    """Two ways: Gauss sums on factors here, the block exponential in `c2d`."""
+    a, q = normal(5, 3, 3, seed=1), torch.eye(3, dtype=DOUBLE)
+    for dt in (0.01, 3.0):
+        factor = ContinuousLinear(a, q).matrices(dt)[2]
+        expected = c2d(ss(a, q), dt, q).noise_covariance
+        scale = expected.abs().amax((-2, -1), keepdim=True)
+        torch.testing.assert_close(factor @ factor.mT / scale, expected / scale, rtol=0, atol=1e-12)
 
 
 def test_beyond_the_reach_is_nan_not_wrong():

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import LinearForm, call_style, check_finite, hold
 from torchfilt.linalg import apply_factor, for_points, is_differentiated, psd_factor, triangularize
+from torchfilt.models.control.systems import hold_input
 from torchfilt.models.ode import rk4
 from torchfilt.spaces import EUCLIDEAN, Space, curved_components
 
@@ -21,29 +22,9 @@ Step = Tensor | float | None
 Integrator = Callable[[Callable[[Tensor], Tensor], Tensor, Tensor | float], Tensor]
 
 # 8 Gauss nodes are exact to rounding up to |A| h = 2; ten doublings of h reach |A| dt = 2048.
-_NODES, _DOUBLINGS, _REACH = 8, 10, 2.0
+_NODES, _WEIGHTS = (values.tolist() for values in np.polynomial.legendre.leggauss(8))
+_DOUBLINGS, _REACH = 10, 2.0
 _HELD_STEPS = 8
-
-
-def zero_order_hold(a: Tensor, b: Tensor | None, dt: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Transition and input matrix of x' = a x + b u over a step in which u is held, by one matrix exponential.
-
-    Args:
-        a: (*batch, d, d).
-        b: (*batch, d, k) or None.
-        dt: (*batch), s.
-
-    Returns:
-        exp(a dt) (*batch, d, d) and the integral of exp(a s) b over the step (*batch, d, k), or None.
-
-    Source: Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23 (1978).
-    """
-    d, step = a.shape[-1], dt[..., None, None]
-    if b is None:
-        return torch.linalg.matrix_exp(a * step), None
-    top = torch.cat([a, b], -1)
-    whole = torch.linalg.matrix_exp(torch.nn.functional.pad(top, (0, 0, 0, b.shape[-1])) * step)
-    return whole[..., :d, :d], whole[..., :d, d:]
 
 
 def noise_factor(a: Tensor, columns: Tensor, dt: Tensor) -> Tensor:
@@ -60,7 +41,7 @@ def noise_factor(a: Tensor, columns: Tensor, dt: Tensor) -> Tensor:
     Returns:
         (*batch, d, d); NaN where the 1-norm of a times dt is above 2048.
     """
-    nodes, weights = (torch.from_numpy(v).to(a) for v in np.polynomial.legendre.leggauss(_NODES))
+    nodes, weights = a.new_tensor(_NODES), a.new_tensor(_WEIGHTS)
     short = dt / 2**_DOUBLINGS
     at = short.unsqueeze(-1) * (nodes + 1) / 2
     scale = (short.unsqueeze(-1) * weights / 2).sqrt()
@@ -206,12 +187,13 @@ class ContinuousLinear(nn.Module):
         return result
 
     def _make(self, dt: Tensor | float) -> tuple[Tensor, Tensor | None, Tensor]:
-        step = dt.squeeze(-1).to(self.a) if isinstance(dt, Tensor) and dt.dim() > 0 else torch.as_tensor(dt).to(self.a)
-        a, b = (part if part is None else for_points(part, 2, step.dim()) for part in (self.a, self.b))
-        assert a is not None
+        step = dt.squeeze(-1) if isinstance(dt, Tensor) and dt.dim() > 0 else dt
+        step = torch.as_tensor(step, dtype=self.a.dtype, device=self.a.device)
+        a = for_points(self.a, 2, step.dim())
         columns = for_points(self.noise(), 2, step.dim())
-        transition, push = zero_order_hold(a, b, step)
-        return transition, push, noise_factor(a, columns, step)
+        b = a.new_zeros(*a.shape[:-1], 0) if self.b is None else for_points(self.b, 2, step.dim())
+        transition, push = hold_input(a, b, step)
+        return transition, push if self.b is not None else None, noise_factor(a, columns, step)
 
     def linear_form(self, u: Tensor | None = None, dt: Step = None) -> LinearForm:
         """The matrices over dt, a number or (*lead, 1), s; u (..., k) enters the offset."""
@@ -350,7 +332,7 @@ class ContinuousTransition(nn.Module):
                 raise ValueError(f"jacobian must give (..., {x.shape[-1]}, {x.shape[-1]}), got {tuple(matrix.shape)}")
             return rate, matrix @ transition
         # One row per column of Phi; each evaluates the same state, so any of them tells its rate.
-        points = x.unsqueeze(-2).expand_as(transition)
+        points = x.unsqueeze(-2).expand_as(transition).contiguous()
         controls = u.unsqueeze(-2) if u is not None and u.dim() > 1 else u
         rate, slope = torch.func.jvp(lambda at: self._called(at, controls), (points,), (transition.mT,))[:2]
         return rate[..., 0, :], slope.mT
