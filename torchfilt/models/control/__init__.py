@@ -1,5 +1,14 @@
 """Linear systems and their design: state space, discretisation, observers, Riccati equations."""
 
+from torchfilt.models.control.design import (
+    KalmanDesign,
+    LqgDesign,
+    Regulator,
+    kalman,
+    lqgr,
+    lqr,
+    place,
+)
 from torchfilt.models.control.systems import (
     Discretized,
     StateSpace,
@@ -16,6 +25,13 @@ from torchfilt.models.control.systems import (
 )
 
 __all__ = [
+    "KalmanDesign",
+    "LqgDesign",
+    "Regulator",
+    "kalman",
+    "lqgr",
+    "lqr",
+    "place",
     "Discretized",
     "StateSpace",
     "as_system",

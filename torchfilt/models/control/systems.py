@@ -36,7 +36,7 @@ class StateSpace:
 
     def __post_init__(self) -> None:
         for name, matrix in self._matrices().items():
-            _check_matrix(matrix, name, self.a)
+            check_matrix(matrix, name, self.a)
         states, controls, outputs = self.a.shape[-1], self.b.shape[-1], self.c.shape[-2]
         wanted = {"a": (states, states), "b": (states, controls), "c": (outputs, states), "d": (outputs, controls)}
         for name, matrix in self._matrices().items():
@@ -309,8 +309,8 @@ def state_noise(a: Tensor, noise: Tensor, noise_input: Tensor | None, name: str)
         TypeError: a dtype other than that of a.
         ValueError: Q, called ``name``, is not symmetric positive semidefinite; shapes do not fit; numbers not finite.
     """
+    check_matrix(noise, name, a)
     psd_factor(noise, name)
-    _check_matrix(noise, name, a)
     if noise_input is None:
         if noise.shape[-1] != a.shape[-1]:
             raise ValueError(
@@ -318,7 +318,7 @@ def state_noise(a: Tensor, noise: Tensor, noise_input: Tensor | None, name: str)
                 f"got shape {tuple(noise.shape)}"
             )
         return noise
-    _check_matrix(noise_input, "noise_input", a)
+    check_matrix(noise_input, "noise_input", a)
     if noise_input.shape[-2:] != (a.shape[-1], noise.shape[-1]):
         wanted = _text((a.shape[-1], noise.shape[-1]))
         raise ValueError(f"noise_input must be (*batch, {wanted}), got shape {tuple(noise_input.shape)}")
@@ -390,7 +390,8 @@ def _check_period(dt: float | Tensor, like: Tensor) -> None:
         raise ValueError(f"dt must be positive and finite, in s (None for continuous time), got {wrong}")
 
 
-def _check_matrix(matrix: Any, name: str, like: Tensor) -> None:
+def check_matrix(matrix: Any, name: str, like: Tensor) -> None:
+    """Refuse what is no finite matrix (*batch, rows, columns) of the dtype of ``like``, under its name."""
     if not isinstance(matrix, Tensor) or not matrix.is_floating_point():
         kind = matrix.dtype if isinstance(matrix, Tensor) else type(matrix).__name__
         raise TypeError(f"{name} must be a floating-point tensor, got {kind}")
