@@ -4,7 +4,8 @@ Directions of a place (gravity, magnetic field, a lamp) are known in world axes 
 fits n of them best minimises Wahba's loss, the weighted sum of |world - R(q) body|^2 / 2 over unit vectors.
 
 All functions look at their input and name what is wrong with it: they are for starts, not for hot loops. Weights are
-relative; those that give the smallest covariance are 1 / sd^2 with sd of a direction in rad.
+relative; those that give the smallest covariance are 1 / sd^2 with sd of a direction in rad. The arithmetic is float64
+whatever the dtype of the input, which the result has again: what float32 rounds away is the directions' own.
 """
 
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from torchfilt.models.attitude.rotations import from_matrix, multiply, rotate
 
 # How near a solution may be to another, in units of rounding: a thousandth is then left of the digits.
 _MARGIN = 1e3
+_EPS = torch.finfo(torch.float64).eps
 # Newton halves the distance where two roots nearly meet, and squares it elsewhere.
 _NEWTON_STEPS = 60
 
@@ -31,11 +33,12 @@ class WahbaSolution(NamedTuple):
 
 
 class _Directions(NamedTuple):
-    """Unit vectors (..., n, 3) of the body and the world, and their weights (..., n)."""
+    """Unit vectors (..., n, 3) of the body and the world, and their weights (..., n), float64; and the dtype given."""
 
     body: Tensor
     world: Tensor
     weights: Tensor
+    dtype: torch.dtype
 
 
 def triad(body: Tensor, world: Tensor) -> WahbaSolution:
@@ -79,9 +82,9 @@ def davenport_q(body: Tensor, world: Tensor, weights: Tensor | None = None) -> W
     """
     seen = _directions(body, world, weights)
     profile = _profile(seen)
-    _check_gap(profile, _MARGIN * torch.finfo(body.dtype).eps)
+    _check_gap(seen, profile, _MARGIN * _EPS)
     sums, trace, cross = _davenport(profile)
-    eye = torch.eye(3, dtype=body.dtype, device=body.device)
+    eye = torch.eye(3, dtype=profile.dtype, device=profile.device)
     top = torch.cat([sums - trace[..., None, None] * eye, cross.unsqueeze(-1)], -1)
     low = torch.cat([cross, trace.unsqueeze(-1)], -1).unsqueeze(-2)
     return _solution(seen, torch.linalg.eigh(torch.cat([top, low], -2)).eigenvectors[..., -1])
@@ -90,8 +93,8 @@ def davenport_q(body: Tensor, world: Tensor, weights: Tensor | None = None) -> W
 def quest(body: Tensor, world: Tensor, weights: Tensor | None = None) -> WahbaSolution:
     """Best attitude by Newton's method on the characteristic polynomial of Davenport's matrix.
 
-    The polynomial loses digits where its two greatest roots meet: vectors of equal weight must be some 0.06 deg apart
-    in float64 and 8 deg in float32, where `davenport_q` and `wahba_svd` do with 4e-5 deg and 0.9 deg. The closed form
+    The polynomial loses digits where its two greatest roots meet: vectors of equal weight must be some 0.08 deg apart,
+    where `davenport_q` and `wahba_svd` do with 5e-5 deg, and 0.01 deg for vectors in float32. The closed form
     of the vector fails at turns of 180 deg, so it is taken in the four sets of axes that a half turn about x, y, z or
     none at all gives, and the best conditioned counts.
 
@@ -102,10 +105,10 @@ def quest(body: Tensor, world: Tensor, weights: Tensor | None = None) -> WahbaSo
     """
     seen = _directions(body, world, weights)
     profile = _profile(seen)
-    _check_gap(profile, (_MARGIN * torch.finfo(body.dtype).eps) ** 0.5)
+    _check_gap(seen, profile, (_MARGIN * _EPS) ** 0.5)
     greatest = _greatest_root(profile)
-    half_turns = torch.eye(4, dtype=body.dtype, device=body.device)  # x, y, z, none: as quaternions
-    signs = torch.tensor([[1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, 1]], dtype=body.dtype, device=body.device)
+    half_turns = torch.eye(4, dtype=profile.dtype, device=profile.device)  # x, y, z, none: as quaternions
+    signs = profile.new_tensor([[1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, 1]])
     each = _eigenvector(profile.unsqueeze(-3) * signs.unsqueeze(-2), greatest.unsqueeze(-1))
     length = torch.linalg.vector_norm(each, dim=-1)
     best = length.argmax(-1, keepdim=True)
@@ -123,7 +126,7 @@ def wahba_svd(body: Tensor, world: Tensor, weights: Tensor | None = None) -> Wah
     """
     seen = _directions(body, world, weights)
     profile = _profile(seen)
-    _check_gap(profile, _MARGIN * torch.finfo(body.dtype).eps)
+    _check_gap(seen, profile, _MARGIN * _EPS)
     left, _, right = torch.linalg.svd(profile)
     # A reflection would fit better where the determinants differ: the weakest axis gives way.
     sign = torch.linalg.det(left) * torch.linalg.det(right)
@@ -148,16 +151,18 @@ def attitude_covariance(world: Tensor, sds_rad: Tensor) -> Tensor:
     _check_vectors("world", world)
     _check_per_vector("sds_rad", sds_rad, world.shape)
     _refuse(~((sds_rad > 0) & torch.isfinite(sds_rad)), sds_rad, "sds_rad must be positive and finite")
-    weights = sds_rad.to(world.dtype).square().reciprocal()
+    dtype, world = world.dtype, world.double()
+    weights = sds_rad.double().square().reciprocal()
     unit = world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
     total = weights.sum(-1)[..., None, None]
     eye = torch.eye(3, dtype=world.dtype, device=world.device)
     information = eye - ((unit * weights.unsqueeze(-1)).mT @ unit) / total
     least = torch.linalg.eigvalsh(information)[..., 0]
-    limit = _MARGIN * torch.finfo(world.dtype).eps
-    _refuse(least <= limit, least, f"directions must not all lie on one line, least share of information > {limit:.1e}")
+    limit = _MARGIN * _EPS
+    rule = "directions must not all lie on one line, nor differ too much in precision"
+    _refuse(least <= limit, least, f"{rule}: least share of information > {limit:.1e}")
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(information))
-    return inverse / total
+    return (inverse / total).to(dtype)
 
 
 def initial_attitude(
@@ -192,16 +197,18 @@ def initial_attitude(
     for name, vectors in (("accel_m_s2", accel_m_s2), ("mag", mag), ("field", field)):
         if vectors.dim() < 1 or vectors.shape[-1] != 3:
             raise ValueError(f"{name} must be (..., 3), got {tuple(vectors.shape)}")
+        if vectors.dtype != accel_m_s2.dtype:
+            raise ValueError(f"{name} must have the dtype of accel_m_s2, {accel_m_s2.dtype}, got {vectors.dtype}")
     up = field.new_tensor([0.0, 0.0, 1.0]).expand_as(field)
     body, world = torch.stack(torch.broadcast_tensors(accel_m_s2, mag), -2), torch.stack([up, field], -2)
     _check_vectors("body (acceleration, field)", body)
     lengths = torch.linalg.vector_norm(body, dim=-1)
-    sds_rad = lengths.new_tensor([accel_sd_m_s2, mag_sd]) / lengths
+    sds_rad = body.new_tensor([accel_sd_m_s2, mag_sd], dtype=torch.float64) / lengths
     quaternion = wahba_svd(body, world, sds_rad.square().reciprocal()).quaternion
     world = world.expand(*quaternion.shape[:-1], 2, 3)
     bias = quaternion.new_zeros(3) if gyro_bias_rad_s is None else gyro_bias_rad_s
     mean = torch.cat([quaternion, bias.expand(*quaternion.shape[:-1], 3)], -1)
-    own = psd_factor(attitude_covariance(world, sds_rad))
+    own = psd_factor(attitude_covariance(world.double(), sds_rad)).to(mean.dtype)
     eye = torch.eye(3, dtype=mean.dtype, device=mean.device)
     factor = torch.cat(
         [
@@ -281,7 +288,8 @@ def _solution(seen: _Directions, quaternion: Tensor) -> WahbaSolution:
     quaternion = torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
     # One less the eigenvalue would lose the digits of a loss that is small.
     off = seen.world - rotate(quaternion.unsqueeze(-2), seen.body)
-    return WahbaSolution(quaternion, (seen.weights * off.square().sum(-1)).sum(-1) / 2)
+    loss = (seen.weights * off.square().sum(-1)).sum(-1) / 2
+    return WahbaSolution(quaternion.to(seen.dtype), loss.to(seen.dtype))
 
 
 # Checks ---------------------------------------------------------------------------------------------------------------
@@ -301,8 +309,9 @@ def _directions(body: Tensor, world: Tensor, weights: Tensor | None) -> _Directi
     _refuse(~((weights >= 0) & torch.isfinite(weights)), weights, "weights must be >= 0 and finite")
     total = weights.sum(-1)
     _refuse(total <= 0, total, "weights must not all be zero")
-    body, world = (v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in (body, world))
-    return _Directions(body, world, weights.to(body.dtype).expand(body.shape[:-1]))
+    dtype = body.dtype
+    body, world = (v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in (body.double(), world.double()))
+    return _Directions(body, world, weights.double().expand(body.shape[:-1]), dtype)
 
 
 def _check_vectors(name: str, vectors: Tensor) -> None:
@@ -319,11 +328,21 @@ def _check_per_vector(name: str, values: Tensor, shape: torch.Size) -> None:
         raise ValueError(f"{name} must be (n,) or (..., n) for vectors {tuple(shape)}, got {tuple(values.shape)}")
 
 
-def _check_gap(profile: Tensor, limit: float) -> None:
+def _check_gap(seen: _Directions, profile: Tensor, limit: float) -> None:
     """Half the distance between the two greatest eigenvalues, by singular values: zero where a turn is left open."""
+    rule = "directions must tell one attitude, not lie on one line, be mirrored or have weights too unequal: gap"
+    gap = _gap(profile)
+    _refuse(gap <= limit, gap, f"{rule} > {limit:.1e}")
+    if seen.dtype != profile.dtype:
+        # Directions apart by an angle have a gap of its square over 4, whatever they weigh: is it more than rounding?
+        gap = _gap(_profile(seen._replace(weights=(seen.weights > 0).to(profile.dtype))))
+        limit = (_MARGIN * torch.finfo(seen.dtype).eps) ** 2 / 4
+        _refuse(gap <= limit, gap, f"{rule} in {seen.dtype} > {limit:.1e}")
+
+
+def _gap(profile: Tensor) -> Tensor:
     _, second, third = torch.linalg.svdvals(profile).unbind(-1)
-    gap = second + torch.linalg.det(profile).sign() * third
-    _refuse(gap <= limit, gap, f"directions must tell one attitude, not lie on one line: gap > {limit:.1e}")
+    return second + torch.linalg.det(profile).sign() * third
 
 
 def _refuse(bad: Tensor, values: Tensor, rule: str) -> None:
