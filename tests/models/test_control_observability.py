@@ -279,7 +279,7 @@ def test_the_stripped_matrix_may_stand_in_where_what_is_unseen_does_not_move():
     assert np.allclose(stripping_defect(blind, time_scale=5.0), [0.0, 5.0])
     scale = torch.tensor([10.0, 1.0, 1.0], dtype=DOUBLE)
     assert np.allclose(stripping_defect(blind, scale=scale), [0.0, 0.1])
-    assert stripping_defect(blind, tolerance=1e3).min() > 1  # nothing counts as seen: all of a is left
+    assert np.allclose(stripping_defect(blind, tolerance=1e3), [1.0, 1.0])  # nothing counts as seen: all of a is left
     # An INS in level flight: the gyro's bias about up is not seen and turns the heading, not seen either.
     heading = stripping_defect(flight("level"), scale=INS_ERROR_SCALE)
     assert float(heading) == pytest.approx(1e-3 / 1e-2)
@@ -314,14 +314,12 @@ def test_pieces_may_be_systems_and_batches():
 # Errors of an INS -----------------------------------------------------------------------------------------------------
 
 
-def strapdown(state, dt, count, rate, force_body, biases):
-    """Attitude matrix, velocity, position over flat ground, by numpy: midpoint turns, level axes that don't turn."""
-    gyro, accel = biases
+def strapdown(axes, velocity, position, gyro, accel, dt, count, rate, force_body):
+    """Runs (n, ...) of a strapdown over flat ground, by numpy: axes that don't turn, the force of half-way."""
     turn = linalg.expm(skewed((rate + gyro) * dt))
     half = linalg.expm(skewed((rate + gyro) * dt / 2))
-    axes, velocity, position = state
     for _ in range(count):
-        push = axes @ half @ (force_body + accel) - np.array([0, 0, G])
+        push = (axes @ half @ (force_body + accel)[..., None])[..., 0] - np.array([0, 0, G])
         position = position + velocity * dt + push * dt**2 / 2
         velocity = velocity + push * dt
         axes = axes @ turn
@@ -329,12 +327,12 @@ def strapdown(state, dt, count, rate, force_body, biases):
 
 
 def skewed(v):
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.cross(np.asarray(v)[..., None, :], np.eye(3)).swapaxes(-1, -2)
 
 
 @pytest.mark.parametrize("name", ["level", "acceleration", "banked turn", "climb"])
 def test_errors_of_an_ins_grow_as_two_flights_drift_apart(name):
-    """Oracle: the nonlinear strapdown, flown with and without the errors, seen from axes that turn with the heading."""
+    """Oracle: the nonlinear strapdown flown with the errors and without, seen from axes that turn with the heading."""
     force, rate, turned = {
         "level": (LEVEL, 0.0, None),
         "acceleration": (FASTER, 0.0, None),
@@ -344,21 +342,21 @@ def test_errors_of_an_ins_grow_as_two_flights_drift_apart(name):
     a, _ = ins_error_pair(force, rate, attitude=turned)
     body = np.eye(3) if turned is None else attitude.to_matrix(turned).numpy()
     rate_body, force_body = body.T @ [0, 0, rate], body.T @ force.numpy()
-    dt, count = 1e-3, 4000
-    true = strapdown((body, np.zeros(3), np.zeros(3)), dt, count, rate_body, force_body, (np.zeros(3), np.zeros(3)))
-    heading = linalg.expm(skewed([0, 0, rate * dt * count]))
-    phi = linalg.expm(a.numpy() * dt * count)
-    for k in range(15):
-        size = 1e-6 * float(INS_ERROR_SCALE[k])
-        error = np.eye(15)[k] * size
-        start = (linalg.expm(skewed(error[:3])) @ body, error[3:6], error[6:9])
-        computed = strapdown(start, dt, count, rate_body, force_body, (error[9:12], error[12:15]))
-        apart = computed[0] @ true[0].T
-        tilt = np.array([apart[2, 1] - apart[1, 2], apart[0, 2] - apart[2, 0], apart[1, 0] - apart[0, 1]]) / 2
-        vectors = [heading.T @ v for v in (tilt, computed[1] - true[1], computed[2] - true[2])]
-        found = np.concatenate([*vectors, error[9:]]) / size
-        # The mechanisation errs by (rate dt)^2 of the force, rounding by 1e-16 / size of metres that grow to 100.
-        assert np.allclose(found, phi[:, k], rtol=1e-6, atol=2e-6 * np.abs(phi[:, k]).max())
+    dt, count = 4e-3, 1000
+    sizes = 1e-3 * INS_ERROR_SCALE.numpy()
+    error = np.concatenate([np.diag(sizes), -np.diag(sizes), np.zeros((1, 15))])
+    start, velocity, position, gyro, accel = error.reshape(31, 5, 3).swapaxes(0, 1)
+    axes = linalg.expm(skewed(start)) @ body
+    axes, *moved = strapdown(axes, velocity, position, gyro, accel, dt, count, rate_body, force_body)
+    apart = axes @ axes[-1].T
+    tilt = np.stack([apart[:, 2, 1], apart[:, 0, 2], apart[:, 1, 0]], -1)
+    tilt -= np.stack([apart[:, 1, 2], apart[:, 2, 0], apart[:, 0, 1]], -1)
+    heading = linalg.expm(skewed([0.0, 0.0, rate * dt * count]))
+    after = np.concatenate([part @ heading for part in (tilt / 2, *moved)] + [gyro, accel], -1)
+    found = (after[:15] - after[15:30]).T / (2 * sizes)
+    scaled = linalg.expm(a.numpy() * dt * count) * sizes / sizes[:, None]
+    # What central differences leave of errors of 1e-5 rad, and of a mechanisation whose turn per step is 4e-4 rad.
+    assert np.allclose(found * sizes / sizes[:, None], scaled, rtol=0, atol=1e-6 * np.abs(scaled).max())
 
 
 def test_sensors_of_an_ins():
@@ -586,6 +584,7 @@ def test_the_landing_on_quaternions_against_its_own_first_order():
 # Errors ---------------------------------------------------------------------------------------------------------------
 
 A, C = CHAIN, row(1.0, 0.0, 0.0)
+NOSE_UP = torch.tensor([math.pi / 2, 0.0, 0.0], dtype=DOUBLE)
 NAN = torch.full((1, 3), math.nan, dtype=DOUBLE)
 
 
@@ -637,21 +636,21 @@ NAN = torch.full((1, 3), math.nan, dtype=DOUBLE)
         (
             lambda: ins_error_pair(LEVEL[:2]),
             ValueError,
-            r"specific_force_m_s2 must be \(\*batch, 3\), got shape \(2,\)",
+            r"specific_force_m_s2 must be .* got shape \(2,\)",
         ),
         (lambda: ins_error_pair(LEVEL * math.inf), ValueError, "specific_force_m_s2 must be finite"),
         (lambda: ins_error_pair(LEVEL, math.nan), ValueError, "turn_rate_rad_s must be finite"),
         (
             lambda: ins_error_pair(LEVEL, 0.0, ("gps",)),
             ValueError,
-            r"sensors must be some of position, .* got \('gps',\)",
+            r"some of position, .* got \('gps',\)",
         ),
         (lambda: ins_error_pair(LEVEL, 0.0, ()), ValueError, "sensors must be some of"),
         (lambda: ins_error_pair(LEVEL, 0.0, "heading"), ValueError, "sensors must be some of .* got 'heading'"),
         (
             lambda: ins_error_pair(LEVEL, attitude=LEVEL),
             ValueError,
-            r"attitude must be a quaternion .* got shape \(3,\)",
+            r"attitude must be .* got shape \(3,\)",
         ),
         (
             lambda: ins_error_pair(
