@@ -132,7 +132,7 @@ def test_a_bank_settles_from_half_a_turn_and_a_second_run_reads_its_stages(tmp_p
     assert json.loads((tmp_path / "metrics.json").read_text())["filters"] == summary["filters"]
     assert {path.name for path in (tmp_path / "figures").iterdir()} >= {"errors.png", "bias.png"}
     again = run_imu_mag(SHORT, tmp_path, ("mekf",), say=lines.append, figures=False, progress=True)
-    assert again["filters"]["mekf"] == summary["filters"]["mekf"]
+    assert again["filters"]["mekf"] == summary["filters"]["mekf"] and "mekf: as before" in lines
 
 
 @pytest.mark.slow

@@ -261,7 +261,7 @@ def test_the_bank_settles_from_any_pose_and_a_second_run_reads_its_stages(tmp_pa
     names = {path.name for path in (tmp_path / "figures").iterdir()}
     assert names >= {"path.png", "errors.png", "bands_llpf.png", "bands_ukf.png"}
     again = run_stars(SHORT, tmp_path, ("llpf",), say=lines.append, figures=False, progress=True)
-    assert again["filters"]["llpf"] == bank
+    assert again["filters"]["llpf"] == bank and "llpf: as before" in lines
     assert sum(line.startswith("llpf") for line in lines) == 4
 
 

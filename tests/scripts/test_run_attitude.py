@@ -46,6 +46,8 @@ def test_each_scenario_has_its_study(tmp_path, scenario, folder):
     assert code == 0 and "mekf: " in out, err
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert list(found["filters"]) == ["mekf"] and found["settings"]["data"] == str(data)
+    code, out, err = run(*options, "--out", tmp_path, "--resume")
+    assert code == 0 and "mekf: as before" in out, err
 
 
 @pytest.mark.parametrize(

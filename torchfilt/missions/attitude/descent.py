@@ -12,7 +12,6 @@ The barometer is withheld for some seconds again and again; the height then pred
 There is no truth in this log and no reference for the attitude.
 """
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -29,7 +28,8 @@ import torchfilt as tf
 from torchfilt.io.rocket_descent import RocketDescent, read_rocket_descent
 from torchfilt.laws import hold
 from torchfilt.missions.attitude.motion import to_ends
-from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.missions.attitude.study import digest, run_study
+from torchfilt.missions.stages import Arrays, check_names
 from torchfilt.models.attitude import (
     inverse,
     rotate,
@@ -530,29 +530,18 @@ def run_descent(
     """
     names = FILTERS if filters is None else tuple(filters)
     check_names(names, FILTERS, "filters")
-    folder = Path(out)
-    stages = Stages(folder / "stages", say)
     descent = make_descent(read_rocket_descent(settings.data), settings)
-    digest = hashlib.sha256()
-    for value in descent:
-        digest.update(value.numpy().tobytes() if isinstance(value, Tensor) else str(value).encode())
-    results: dict[str, Arrays] = {}
-    summary: dict[str, Any] = {"filters": {}}
-    for name in names:
-        recipe = {"version": _VERSION, **asdict(settings), "descent": digest.hexdigest()}
-        kept = stages.has(name, recipe)
-        results[name] = stages.get(name, recipe, lambda name=name: follow(name, descent, settings, progress))  # type: ignore[misc]
-        summary["filters"][name] = summarize(results[name], descent, settings)
-        say(f"{name}: {'as before' if kept else format(results[name]['cpu_s'], '.1f') + ' s of CPU'}")
-    summary |= {"settings": asdict(settings), "versions": versions()}
-    lines = table(summary)
-    for line in lines:
-        say(line)
-    write_outcome(folder, lines, summary)
-    if figures:
-        for path in _figures(results, descent, folder / "figures"):
-            say(f"wrote {path}")
-    return summary
+    return run_study(
+        names,
+        settings,
+        {"version": _VERSION, "descent": digest(descent)},
+        out,
+        follow=lambda name: follow(name, descent, settings, progress),
+        summarize=lambda result: summarize(result, descent, settings),
+        table=table,
+        draw=(lambda results, folder: _figures(results, descent, folder)) if figures else None,
+        say=say,
+    )
 
 
 def _figures(results: dict[str, Arrays], descent: Descent, folder: Path) -> list[Path]:

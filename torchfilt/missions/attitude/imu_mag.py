@@ -8,7 +8,6 @@ The magnetometer lags behind the gyro, see `field_delay`. A lag of 14 ms is an e
 log; it is undone by a filter that runs as much later.
 """
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -23,7 +22,8 @@ from torch import Tensor, nn
 import torchfilt as tf
 from torchfilt.io.imu_mag_mocap import ImuMagLog, read_imu_mag_mocap
 from torchfilt.missions.attitude.motion import to_ends
-from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.missions.attitude.study import digest, run_study
+from torchfilt.missions.stages import Arrays, check_names
 from torchfilt.models.attitude import from_rotation_vector, inverse, multiply, rotate, to_rotation_vector
 from torchfilt.models.attitude.kinematics import ATTITUDE_SPACE, GyroTransition, VectorMeasurement
 from torchfilt.spaces import EUCLIDEAN
@@ -397,29 +397,18 @@ def run_imu_mag(
     """
     names = FILTERS if filters is None else tuple(filters)
     check_names(names, FILTERS, "filters")
-    folder = Path(out)
-    stages = Stages(folder / "stages", say)
-    log = read_imu_mag_mocap(settings.data)
-    motion = make_motion(log, settings)
-    found = hashlib.sha256()
-    for value in motion:
-        found.update(value.numpy().tobytes() if isinstance(value, Tensor) else str(value).encode())
-    results: dict[str, Arrays] = {}
-    summary: dict[str, Any] = {"filters": {}}
-    for name in names:
-        recipe = {"version": _VERSION, **asdict(settings), "motion": found.hexdigest()}
-        results[name] = stages.get(name, recipe, lambda name=name: follow(name, motion, settings, progress))  # type: ignore[misc]
-        summary["filters"][name] = summarize(results[name], motion, settings)
-        say(f"{name}: {results[name]['cpu_s']:.1f} s of CPU")
-    summary |= {"settings": asdict(settings), "versions": versions()}
-    lines = table(summary)
-    for line in lines:
-        say(line)
-    write_outcome(folder, lines, summary)
-    if figures:
-        for path in _figures(results, settings, folder / "figures"):
-            say(f"wrote {path}")
-    return summary
+    motion = make_motion(read_imu_mag_mocap(settings.data), settings)
+    return run_study(
+        names,
+        settings,
+        {"version": _VERSION, "motion": digest(motion)},
+        out,
+        follow=lambda name: follow(name, motion, settings, progress),
+        summarize=lambda result: summarize(result, motion, settings),
+        table=table,
+        draw=(lambda results, folder: _figures(results, settings, folder)) if figures else None,
+        say=say,
+    )
 
 
 def _figures(results: dict[str, Arrays], settings: ImuMagSettings, folder: Path) -> list[Path]:

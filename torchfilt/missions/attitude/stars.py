@@ -9,11 +9,10 @@ A filter of a step knows the beacons that the step sees and no others; the belie
 NaN for the rest would say the same, at a multiple of the price.
 """
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,8 @@ import torchfilt as tf
 from torchfilt.io.starry_night import Camera, StarryNight, read_starry_night
 from torchfilt.laws import hold
 from torchfilt.metrics import nees
-from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.missions.attitude.study import digest, run_study
+from torchfilt.missions.stages import Arrays, check_names
 from torchfilt.models.attitude import from_rotation_vector, inverse, mean_rotation, multiply, rotate, skew, to_matrix
 from torchfilt.particles import uniform_log_weights
 from torchfilt.spaces import EUCLIDEAN, Euclidean, Product, UnitQuaternion
@@ -451,29 +451,18 @@ def run_stars(
     """
     names = FILTERS if filters is None else tuple(filters)
     check_names(names, FILTERS, "filters")
-    folder = Path(out)
-    stages = Stages(folder / "stages", say)
     log = read_part(settings)
-    digest = hashlib.sha256()
-    for value in (*log[:-3], *log.camera[:2], *log[-2:]):
-        assert isinstance(value, Tensor)
-        digest.update(value.numpy().tobytes())
-    results: dict[str, Arrays] = {}
-    summary: dict[str, Any] = {"filters": {}}
-    for name in names:
-        recipe = {"version": _VERSION, **asdict(settings), "log": digest.hexdigest()}
-        results[name] = stages.get(name, recipe, lambda name=name: follow(name, log, settings, progress))  # type: ignore[misc]
-        summary["filters"][name] = summarize(results[name])
-        say(f"{name}: {results[name]['cpu_s']:.1f} s of CPU")
-    summary |= {"settings": asdict(settings), "versions": versions()}
-    lines = table(summary)
-    for line in lines:
-        say(line)
-    write_outcome(folder, lines, summary)
-    if figures:
-        for path in _figures(results, folder / "figures"):
-            say(f"wrote {path}")
-    return summary
+    return run_study(
+        names,
+        settings,
+        {"version": _VERSION, "log": digest((*log[:-3], *log.camera[:2], *log[-2:]))},
+        out,
+        follow=lambda name: follow(name, log, settings, progress),
+        summarize=summarize,
+        table=table,
+        draw=_figures if figures else None,
+        say=say,
+    )
 
 
 def _figures(results: dict[str, Arrays], folder: Path) -> list[Path]:
