@@ -1,19 +1,27 @@
 """Measurements that arrive late: the filter goes back to where they belong and comes forward again."""
 
+import io
 import math
+import pickle
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torchfilt.filters.mixture import InteractingMultipleModel
+from torchfilt.gaussian import Gaussian
+from torchfilt.history import space_to_plain
 from torchfilt.laws import AdditiveGaussian, LinearGaussian, call_style
+from torchfilt.particles import Centre, Particles, PastStep
 from torchfilt.run import Filter
 from torchfilt.sensors import PseudoMeasurement, Sensors
+from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
+from torchfilt.storage import NOT_OURS, IntegrityError, read_verified, write_verified
 from torchfilt.symmetry import GaugedTransition
-from torchfilt.types import B, FilterState, Step, StepInfo
+from torchfilt.types import B, FilterState, Guarded, Step, StepInfo
 
 Split = Callable[[Tensor, float], Tensor]
 Action = Literal["on time", "joined", "inserted", "replaced", "skipped"]
@@ -55,7 +63,7 @@ class Arrival(NamedTuple):
         return self.arrived_s - self.time_s
 
 
-class PastStep(NamedTuple):
+class TakenStep(NamedTuple):
     """A step that may be run again: from since_s to time_s over dt, by the control u, measured at its end.
 
     y (*batch, m), NaN where nothing was; before: the filter's state at its start; log_likelihood (*batch): of all that
@@ -81,7 +89,7 @@ class DelayedState(NamedTuple, Generic[B]):
 
     now: FilterState[B]
     time_s: float
-    past: tuple[PastStep, ...]
+    past: tuple[TakenStep, ...]
     arrivals: tuple[Arrival, ...]
     newest_s: tuple[float, ...]
     log_likelihood: Tensor
@@ -222,7 +230,7 @@ class DelayedMeasurements(nn.Module, Generic[B]):
             return self.late(state, y, state.time_s, throw=throw)
         values = self._tensor(state, y) if isinstance(y, Mapping) else y
         # Copies: whoever calls may fill the same buffer again.
-        new = PastStep(state.time_s, end, length, _copy(values), _copy(u), state.now, state.log_likelihood)
+        new = TakenStep(state.time_s, end, length, _copy(values), _copy(u), state.now, state.log_likelihood)
         after, steps = self._run(state, state.past, (new,), throw)
         spoken = self._spoken(~torch.isnan(values))
         log = [Arrival(self.sensors[k], end, end, "on time", False, 1) for k in spoken]
@@ -256,7 +264,9 @@ class DelayedMeasurements(nn.Module, Generic[B]):
         _check_state(state)
         _check_time(time_s)
         if time_s > state.time_s + self.tolerance_s:
-            raise ValueError(f"the measurement is of {time_s} s, but the filter has come to {state.time_s} s only")
+            raise ValueError(
+                f"the measurement is of {time_s:.12g} s, but the filter has come to {state.time_s:.12g} s only"
+            )
         stale = self._stale(state, time_s)
         if stale is not None and self.on_stale == "raise":
             raise ValueError(stale)
@@ -271,8 +281,8 @@ class DelayedMeasurements(nn.Module, Generic[B]):
             again = self._spoken(~torch.isnan(y) & ~torch.isnan(state.past[place].y))
             if again and not replace:
                 raise ValueError(
-                    f"sensor {self.sensors[again[0]]!r} has already been taken in at {state.past[place].time_s} s; "
-                    "to put this measurement in its place say replace=True"
+                    f"sensor {self.sensors[again[0]]!r} has already been taken in at {state.past[place].time_s:.12g} "
+                    "s; to put this measurement in its place say replace=True"
                 )
             actions |= dict.fromkeys(again, "replaced")
         rerun = self._with(state, place, joins, y, time_s)
@@ -298,7 +308,7 @@ class DelayedMeasurements(nn.Module, Generic[B]):
             length, end = dt, now_s + dt
         if length < -self.tolerance_s:
             raise ValueError(
-                f"a step must not run backward, from {now_s} to {time_s} s; a late measurement goes to late()"
+                f"a step must not run backward, from {now_s:.12g} to {time_s:.12g} s; a late measurement goes to late()"
             )
         return (0.0, now_s) if length <= self.tolerance_s else (length, end)
 
@@ -308,14 +318,14 @@ class DelayedMeasurements(nn.Module, Generic[B]):
         start = state.past[0].since_s if state.past else state.time_s
         if time_s < oldest - self.tolerance_s:
             return (
-                f"the measurement is of {time_s} s, at {state.time_s} s the horizon of {self.horizon_s} s reaches back "
-                f"to {oldest} s only"
+                f"the measurement is of {time_s:.12g} s, at {state.time_s:.12g} s the horizon of {self.horizon_s} s "
+                f"reaches back to {oldest:.12g} s only"
             )
         if time_s < start - self.tolerance_s:
-            return f"the measurement is of {time_s} s, before the prior at {start} s"
+            return f"the measurement is of {time_s:.12g} s, before the prior at {start:.12g} s"
         return None
 
-    def _find(self, past: tuple[PastStep, ...], time_s: float) -> tuple[int, bool]:
+    def _find(self, past: tuple[TakenStep, ...], time_s: float) -> tuple[int, bool]:
         """The step that a time belongs to, and whether it ends there."""
         place = bisect_left(past, time_s - self.tolerance_s, key=lambda one: one.time_s)
         return place, place < len(past) and abs(past[place].time_s - time_s) <= self.tolerance_s
@@ -356,23 +366,23 @@ class DelayedMeasurements(nn.Module, Generic[B]):
     # ------------------------------------------------------------------------------------------------------------------
     # Steps
 
-    def _with(self, state: DelayedState[B], place: int, joins: bool, y: Tensor, time_s: float) -> tuple[PastStep, ...]:
+    def _with(self, state: DelayedState[B], place: int, joins: bool, y: Tensor, time_s: float) -> tuple[TakenStep, ...]:
         """The steps from ``place`` on with the measurement among them."""
-        rest: tuple[PastStep, ...] = state.past[place:]
+        rest: tuple[TakenStep, ...] = state.past[place:]
         if joins:
             return rest[0]._replace(y=torch.where(torch.isnan(y), rest[0].y, y)), *rest[1:]
         start = rest[0].since_s if rest else state.time_s
         if abs(time_s - start) <= self.tolerance_s:  # at the prior: a step without a motion
             before, known = (rest[0].before, rest[0].log_likelihood) if rest else (state.now, state.log_likelihood)
-            return PastStep(start, start, 0.0, y, None, before, known), *rest
+            return TakenStep(start, start, 0.0, y, None, before, known), *rest
         return *self._halves(rest[0], y, time_s), *rest[1:]
 
-    def _halves(self, whole: PastStep, y: Tensor, time_s: float) -> tuple[PastStep, PastStep]:
+    def _halves(self, whole: TakenStep, y: Tensor, time_s: float) -> tuple[TakenStep, TakenStep]:
         """A step as two, with a measurement between them."""
         if self.split is None:
             raise ValueError(
-                f"the measurement is of {time_s} s, within the step from {whole.since_s} to {whole.time_s} s: give "
-                "split=held, split=proportional or a callable where steps may be split"
+                f"the measurement is of {time_s:.12g} s, within the step from {whole.since_s:.12g} to "
+                f"{whole.time_s:.12g} s: give split=held, split=proportional or a callable where steps may be split"
             )
         fraction = (time_s - whole.since_s) / (whole.time_s - whole.since_s)
         shares = (None, None) if whole.u is None else (self.split(whole.u, fraction), self.split(whole.u, 1 - fraction))
@@ -380,7 +390,7 @@ class DelayedMeasurements(nn.Module, Generic[B]):
         return first, whole._replace(since_s=float(time_s), dt=whole.time_s - time_s, u=shares[1])
 
     def _run(
-        self, state: DelayedState[B], kept: tuple[PastStep, ...], steps: tuple[PastStep, ...], throw: bool
+        self, state: DelayedState[B], kept: tuple[TakenStep, ...], steps: tuple[TakenStep, ...], throw: bool
     ) -> tuple[DelayedState[B], tuple[StepInfo, ...]]:
         """Filter through steps, the first of which knows where it starts."""
         now, total = steps[0].before, steps[0].log_likelihood
@@ -421,6 +431,47 @@ class DelayedMeasurements(nn.Module, Generic[B]):
             arrivals=tuple(one for one in (*state.arrivals, *log) if one.arrived_s >= oldest),
             newest_s=newest,
         )
+
+
+FILE_KIND = "torchfilt stream"
+# All that a state is made of; nothing else is ever unpickled.
+_PARTS: list[Any] = [DelayedState, TakenStep, Arrival, FilterState, Gaussian, Particles, Centre, PastStep, Guarded]
+_PARTS += [Euclidean, Angle, UnitQuaternion, Product]
+
+
+def save(state: DelayedState[Any], path: str | Path) -> None:
+    """Write a state with its past and its log, atomically and with a SHA-256 manifest beside it.
+
+    Raises:
+        TypeError: not a state, a space that is not one of the library's own.
+    """
+    _check_state(state)
+    space_to_plain(state.belief.space)
+    stream = io.BytesIO()
+    torch.save(state, stream)
+    write_verified(path, stream.getvalue(), FILE_KIND)
+
+
+def load(path: str | Path) -> DelayedState[Any]:
+    """Read what `save` wrote; a stream that goes on from it gives the same bits as one that was never stopped.
+
+    Raises:
+        FileNotFoundError: no such file.
+        IntegrityError: truncated, altered or foreign; names the file and the rule.
+    """
+    data = read_verified(path, FILE_KIND)
+    try:
+        with torch.serialization.safe_globals(_PARTS):
+            state = torch.load(io.BytesIO(data), weights_only=True)
+    except (*NOT_OURS, pickle.UnpicklingError, RuntimeError, IndexError) as error:
+        raise IntegrityError(f"{path}: not a stream of this version ({error})") from None
+    if not isinstance(state, DelayedState):
+        raise IntegrityError(f"{path}: not a stream of this version (it holds a {type(state).__name__})")
+    return state
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Checks
 
 
 def _copy(given: Any) -> Any:
