@@ -52,7 +52,7 @@ def build_parser() -> ArgumentParser:
         metavar="A,B",
         help=f"out of {', '.join(FILTERS['imu-mag'])}; of descent out of {', '.join(FILTERS['descent'])}; default all",
     )
-    group.add_argument("--data", type=str | None, metavar="DIR", help="folder of the log; default its sample under ./data")
+    group.add_argument("--data", type=str | None, metavar="DIR", help="folder of the log; default: in ./data")
     group.add_argument("--stop-s", type=float | None, metavar="S", help="the log is filtered up to there; to its end")
     group.add_argument("--particles", type=int | None, metavar="N", help="of the bank; what the scenario takes")
     group.add_argument("--seed", default=0, type=int, help="of the bank and of random starts")

@@ -16,7 +16,7 @@ from torchfilt.gp import GPTransition
 from torchfilt.gp.regression import GPRegression
 from torchfilt.io.starry_night import Camera
 from torchfilt.kernels import Regularize
-from torchfilt.missions.attitude import stars
+from torchfilt.missions.attitude import descent, imu_mag, stars
 from torchfilt.models import landing, relative_motion
 from torchfilt.models.attitude import ATTITUDE_SPACE, GyroTransition, VectorMeasurement, kinematics
 from torchfilt.models.inertial import error_model, navigation
@@ -88,6 +88,10 @@ ATTITUDES = ATTITUDE_SPACE.retract(
 )
 POSES = stars.POSE_SPACE.retract(
     torch.tensor([0.5, -0.5, 0.5, 0.5, 1.0, 2.0, -1.0], dtype=DOUBLE), normal(5, 6, seed=25)
+)
+FALLING = descent.DESCENT_SPACE.retract(
+    torch.tensor([900.0, -25.0, 0.3, 2.0, -1.0, 0.5, -0.5, 0.5, 0.5, 0.01, 0.0, -0.01], dtype=DOUBLE),
+    normal(5, 11, seed=31),
 )
 CAMERA = Camera(torch.tensor([0.5, 0.5, -0.5, 0.5], dtype=DOUBLE), normal(3, seed=26, scale=0.1), 0.24)
 INCREMENTS = torch.cat(increments(FLOWN.dtheta_rad / 0.01, FLOWN.dvelocity_m_s / 0.01, 0.01, 20), -1)
@@ -197,6 +201,10 @@ LAWS = {
         torch.tensor([[0.1], [0.2], [0.5], [1.0], [0.05]], dtype=DOUBLE),
     ),
     "Sightings": (stars.Sightings(10 * normal(4, 3, seed=29), CAMERA, normal(2, seed=30).exp()), POSES, None, None),
+    "RestingRate": (imu_mag._RestingRate(1e-3), ATTITUDES, None, None),
+    "DescentMotion": (descent.DescentMotion(descent.DescentSettings(), 0.1), FALLING, normal(3, seed=32), None),
+    "Descent Barometer": (descent.Barometer(87_000.0, 30.0, 0.05, 11), FALLING, None, None),
+    "SpecificForce": (descent.SpecificForce(0.7), FALLING, None, None),
     "NavigationFixes": (NavigationFixes(position_sd_m=2.0, heading_sd_rad=0.1), STATES, None, None),
     "NavigationFixes all, with arms": (
         NavigationFixes(
@@ -262,11 +270,12 @@ def test_laws(name):
 
 def test_every_law_is_registered():
     """Modules of the package whose call gives a Gaussian: none may be left out."""
-    laws = {type(law).__name__ for law, *_ in LAWS.values()}
+    laws = {type(law) for law, *_ in LAWS.values()}
+    models = (relative_motion, error_model, navigation, kinematics, landing, stars, descent, imu_mag)
     shipped = {
-        name
-        for module in (tf.laws, tf.sensors, relative_motion, error_model, navigation, kinematics, landing, stars, tf.gp)
-        for name, member in inspect.getmembers(module, inspect.isclass)
+        member
+        for module in (tf.laws, tf.sensors, tf.gp, *models)
+        for _, member in inspect.getmembers(module, inspect.isclass)
         if issubclass(member, nn.Module)
         and inspect.signature(member.forward).return_annotation in (tf.Gaussian, "Gaussian")
     }
