@@ -61,7 +61,7 @@ def test_lamb_factors_are_those_of_the_integrals(slenderness):
 
 
 def test_lamb_factors_of_the_tables():
-    """Lamb's article 115: k1, k2, k' by slenderness, which is rounded to 0.005 there: 0.002 in k'; needle and sphere."""
+    """Lamb's article 115: k1, k2, k' by slenderness, rounded there to 0.005 or 0.002 in k'; needle and sphere."""
     table = {1.5: (0.305, 0.621, 0.094), 2.99: (0.122, 0.803, 0.465), 9.97: (0.021, 0.960, 0.883)}
     for slenderness, row in table.items():
         np.testing.assert_allclose(lamb_factors(slenderness), row, atol=2e-3)
@@ -128,8 +128,8 @@ def test_static_equilibrium(yaw):
 
 
 def test_energy_and_momentum_without_friction():
-    """Neutral: energy and vertical angular momentum stay, and all of the linear momentum. RK4 at 1/400 s: 1e-9."""
-    law = AirshipTransition(STILL, steps=400)
+    """Neutral: energy and vertical angular momentum stay, and all of the linear momentum. RK4 at 1/200 s: 2e-9."""
+    law = AirshipTransition(STILL, steps=200)
     x = states()
     matrix = inertia_matrix(STILL)
 
@@ -142,10 +142,10 @@ def test_energy_and_momentum_without_friction():
     energy, (linear, vertical) = law.energy(x), momenta(x)
     for _ in range(5):
         x = law(x, None, 1.0).mean
-    torch.testing.assert_close(law.energy(x), energy, rtol=1e-9, atol=0)
+    torch.testing.assert_close(law.energy(x), energy, rtol=2e-9, atol=0)
     after = momenta(x)
-    torch.testing.assert_close(after[0], linear, rtol=0, atol=1e-9)
-    torch.testing.assert_close(after[1], vertical, rtol=0, atol=1e-9)
+    torch.testing.assert_close(after[0], linear, rtol=0, atol=2e-9)
+    torch.testing.assert_close(after[1], vertical, rtol=0, atol=2e-9)
     assert (x[:, 4:7] - states()[:, 4:7]).abs().max() > 0.05  # momentum stays, velocity does not
 
 
@@ -295,16 +295,16 @@ def test_turning_about_the_vertical(yaw):
 
 @pytest.mark.parametrize("ship", [SHIP, OTHER], ids=["default", "other"])
 def test_against_scipy(ship):
-    """1.5 s by an adaptive integration of momentum in world axes; 1e-8 with the kinks of the drag across met on the way.
+    """One second by an adaptive integration of momentum in world axes; 1e-8 with kinks of the drag met on the way.
 
-    The ship flies forward, so that the fins, which have the sharper kink, meet none.
+    The ship flies forward in the air throughout: where that speed changes its sign the fins have a sharper kink.
     """
-    law, thrust, wind = AirshipTransition(ship, steps=1200), [0.1, -0.05, 0.03], [0.2, 0.1, -0.05]
-    x = states(3, seed=2)
-    x[:, 4:7] = x[:, 4:7] / 2 + rotate(x[:, :4], torch.tensor([0, 2.0, 0], dtype=DOUBLE))
-    end = law(x, torch.tensor(thrust + wind, dtype=DOUBLE), 1.5).mean.numpy()
+    law, thrust, wind = AirshipTransition(ship, steps=500), [0.1, -0.05, 0.03], [0.2, 0.1, -0.05]
+    x = states(3, seed=3)
+    x[:, 4:7] = x[:, 4:7] / 4 + rotate(x[:, :4], torch.tensor([0, 1.0, 0], dtype=DOUBLE))
+    end = law(x, torch.tensor(thrust + wind, dtype=DOUBLE), 1.0).mean.numpy()
     for row, found in zip(x.numpy(), end, strict=True):
-        assert np.abs(oracle.local(oracle.fly(asdict(ship), row, 1.5, thrust, wind), found)).max() < 1e-8
+        assert np.abs(oracle.local(oracle.fly(asdict(ship), row, 1.0, thrust, wind), found)).max() < 1e-8
         assert np.abs(oracle.local(row, found)).max() > 0.5
 
 

@@ -274,8 +274,8 @@ class AirshipTransition(nn.Module):
 
     def rates(self, x: Tensor, wrench: Tensor, air_velocity: Tensor) -> Tensor:
         """Derivative (..., 13) of the state by time; arguments as in `advance`."""
-        # Rotations by the direction of the quaternion alone: its norm, which the stages of a step change, has no part in
-        # the motion, and turning the world commutes with every stage.
+        # Only the direction of the quaternion turns: its norm, which the stages of a step change, has no part in the
+        # motion, and turning the world commutes with every stage.
         q = x[..., :4] * x[..., :4].square().sum(-1, keepdim=True).rsqrt()
         back = inverse(q)
         motion = torch.cat(torch.broadcast_tensors(rotate(back, x[..., 4:7] - air_velocity), x[..., 10:]), -1)
