@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import LinearForm, call_style, check_finite, hold
+from torchfilt.laws import LinearForm, LinearGaussian, call_style, check_finite, hold
 from torchfilt.linalg import apply_factor, for_points, is_differentiated, psd_factor, triangularize
-from torchfilt.models.control.systems import hold_input
+from torchfilt.model import StateSpaceModel
+from torchfilt.models.control.systems import as_system, hold_input, state_noise
 from torchfilt.models.ode import rk4
 from torchfilt.spaces import EUCLIDEAN, Space, curved_components
 
@@ -342,3 +343,36 @@ class ContinuousTransition(nn.Module):
         if rate.shape != x.shape:
             raise ValueError(f"drift must turn x {tuple(x.shape)} into as many numbers, got {tuple(rate.shape)}")
         return rate
+
+
+def linear_model(
+    system: Any,
+    process_noise: Tensor,
+    measurement_noise: Tensor,
+    initial: Gaussian,
+    noise_input: Tensor | None = None,
+) -> StateSpaceModel:
+    """A linear system with noise as a model for every filter: discrete laws, or exact ones of any dt.
+
+    Args:
+        system: `StateSpace` or ``control.StateSpace``. A continuous one moves between measurements; these are taken at
+            instants.
+        process_noise: of a discrete system the covariance of w in x' = A x + B u + F w, of a continuous one its
+            spectral density; (w, w).
+        measurement_noise: covariance of a measurement (m, m). A density R of continuous measurements, averaged over dt,
+            is the covariance R / dt.
+        initial: the prior.
+        noise_input: F (d, w); None: the identity.
+    """
+    plant = as_system(system)
+    noise = state_noise(plant.a, process_noise, noise_input, "process_noise")
+    if plant.is_discrete:
+        motion: nn.Module = LinearGaussian(plant.a, noise, control_matrix=_given(plant.b))
+    else:
+        motion = ContinuousLinear(plant.a, process_noise, noise_input, _given(plant.b))
+    return StateSpaceModel(initial, motion, LinearGaussian(plant.c, measurement_noise, control_matrix=_given(plant.d)))
+
+
+def _given(matrix: Tensor) -> Tensor | None:
+    """None where the matrix has no effect."""
+    return matrix if matrix.numel() and bool((matrix != 0).any()) else None
