@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 _PART = 1e-6
 """Share of a unit direction below which a state has no part in it: far above rounding, far below anything of use."""
+_SHOWN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +24,7 @@ class ObservabilityReport:
     title: of the sensors or manoeuvre. names: of the d states. rank, singular_values, tolerance: as in `Rank`.
     share (d,): from 0, not observed at all, to 1, observed: squared length of what is left of the state's unit vector
     in the observable subspace, states scaled. directions (d - rank, d): basis of what is not observed, in the states'
-    own units, each row with a 1 at a state that no other row has.
+    own units, each row with a 1 at a state that no other row has. sizes (d,): what a state was scaled by.
     """
 
     title: str
@@ -33,6 +34,7 @@ class ObservabilityReport:
     tolerance: float
     share: Tensor
     directions: Tensor
+    sizes: Tensor
 
     @property
     def unobserved(self) -> tuple[str, ...]:
@@ -53,8 +55,10 @@ class ObservabilityReport:
             f"  {name:{width}s} {share:5.2f}" for name, share in zip(self.names, self.share.tolist(), strict=True)
         ]
         if len(self.directions):
-            lines.append("not observed, in the states' units:")
-        lines += [f"  {self._direction(row)}" for row in self.directions.tolist()]
+            lines.append(f"not observed, in the states' units, parts below {_SHOWN:.0%} of the largest left out:")
+        weight = (self.directions / self.sizes).abs()
+        shown = torch.where(weight >= _SHOWN * weight.amax(-1, keepdim=True), self.directions, 0)
+        lines += [f"  {self._direction(row)}" for row in shown.tolist()]
         return "\n".join(lines)
 
     def _direction(self, row: list[float]) -> str:
@@ -88,15 +92,20 @@ def observability_report(
     _, _, right = torch.linalg.svd(scaled.detach(), full_matrices=True)
     share = 1 - right[seen:].square().sum(0)
     directions = _reduced(right[seen:])
-    if isinstance(scale, Tensor):
-        directions = directions * scale.to(directions)
-    elif scale is not None:
-        length = torch.linalg.vector_norm(matrix.detach(), dim=0)
-        directions = directions / torch.where(length > 0, length, 1)
+    sizes = _sizes(matrix.detach(), scale)
+    directions = directions * sizes
     lead = directions.gather(-1, _leaders(right[seen:]).unsqueeze(-1))
     return ObservabilityReport(
-        title, names, seen, found.singular_values, float(found.tolerance), share.clamp(0, 1), directions / lead
+        title, names, seen, found.singular_values, float(found.tolerance), share.clamp(0, 1), directions / lead, sizes
     )
+
+
+def _sizes(matrix: Tensor, scale: Scale) -> Tensor:
+    """What `scale_columns` multiplied each column by."""
+    if isinstance(scale, Tensor):
+        return scale.to(matrix)
+    length = torch.linalg.vector_norm(matrix, dim=0)
+    return torch.where(length > 0, 1 / length, 1) if scale == "columns" else torch.ones_like(length)
 
 
 def _leaders(basis: Tensor) -> Tensor:
