@@ -6,7 +6,7 @@ A component's covariance seen from another point is carried there, as `Particles
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -309,7 +309,7 @@ class MixtureLaw(nn.Module):
     """A conditional law that is one of several, by chance: noise with outliers, a push that may come or not.
 
     `GaussianSumFilter` follows each of them; other filters get a `MixtureSameFamily`, Gaussian filters of it the
-    moments.
+    moments. Where all laws are `Sensors` of the same names, sizes and constraints, measurements may come by name.
 
     Args:
         laws: k laws of a transition or of a measurement, each giving a `Gaussian`; short cuts that they offer are used.
@@ -340,6 +340,9 @@ class MixtureLaw(nn.Module):
             if isinstance(law, nn.Module):
                 self.add_module(f"law_{k}", law)
         self._styles = [call_style(law) for law in laws]
+        first: Any = laws[0]
+        if hasattr(first, "pack") and all(_same_sensors(first, law, given) for law in laws[1:]):
+            self.names, self.columns, self.parts, self.pack = first.names, first.columns, first.parts, first.pack
 
     @property
     def takes_controls(self) -> bool:
@@ -361,6 +364,15 @@ class MixtureLaw(nn.Module):
         components = MultivariateNormal(mean, scale_tril=factor, validate_args=False)
         chances = Categorical(probs=self.weights.to(mean.dtype).expand(mean.shape[:-1]), validate_args=False)
         return MixtureSameFamily(chances, components, validate_args=False)
+
+
+def _same_sensors(one: Any, other: Any, like: Tensor) -> bool:
+    """Whether both are `torchfilt.Sensors` for which a measurement by name is the same tensor."""
+    if not hasattr(other, "pack") or (one.names, one.sizes, one.parts) != (other.names, other.sizes, other.parts):
+        return False
+    # Where no sensor says anything, what is there are the values of constraints.
+    silent, also = (law.pack({}, (), like.detach()) for law in (one, other))
+    return torch.allclose(silent, also, rtol=0, atol=0, equal_nan=True)
 
 
 def check_probabilities(values: Tensor, name: str) -> None:

@@ -486,3 +486,24 @@ def test_errors():
     with pytest.raises(ValueError, match="needs a factor for its components"):
         filter.step(state._replace(belief=state.belief._replace(scale_tril=None)), torch.zeros(2, dtype=DOUBLE))
     assert reduce(state.belief, 3) is state.belief
+
+
+def test_measurements_by_name_of_a_mixture_of_sensors():
+    """A clean sensor or a dirty one beside another: by name or side by side is the same; the gate's log has both."""
+    eye = torch.eye(2, dtype=DOUBLE)
+    level = tf.PseudoMeasurement(torch.ones(1, 2, dtype=DOUBLE), 1, 0.5, 0.3)
+    fine, rough = (tf.LinearGaussian(eye[:1], variance * eye[:1, :1]) for variance in (0.1, 4.0))
+    laws = [tf.Sensors(a=law, b=tf.LinearGaussian(eye[1:], eye[:1, :1]), level=level) for law in (fine, rough)]
+    prior, motion = tf.Gaussian(torch.zeros(2, dtype=DOUBLE), eye), tf.LinearGaussian(eye, 0.1 * eye)
+    model = tf.StateSpaceModel(prior, motion, tf.MixtureLaw(laws, [0.8, 0.2]))
+    tracker = tf.GaussianSumFilter(model, components=4, gate=tf.Gate(0.99, -5.0))
+    z = torch.tensor([0.4], dtype=DOUBLE)
+    named, info = tracker.step(tracker.init(), {"a": z})
+    packed, _ = tracker.step(tracker.init(), torch.tensor([0.4, torch.nan, 0.3], dtype=DOUBLE))
+    assert torch.equal(named.belief.x, packed.belief.x) and info.accepted.shape == (3,)
+    # Other names, or a constraint of another value, would make another measurement of the same words.
+    other = tf.PseudoMeasurement(torch.ones(1, 2, dtype=DOUBLE), 1, 0.5, 0.7)
+    for last in (tf.Sensors(a=fine, c=fine, level=level), tf.Sensors(a=fine, b=fine, level=other), fine):
+        mixed = tf.GaussianSumFilter(tf.StateSpaceModel(prior, motion, tf.MixtureLaw([laws[0], last], [0.5, 0.5])))
+        with pytest.raises(TypeError, match="measurements by name need Sensors"):
+            mixed.step(mixed.init(), {"a": z})
