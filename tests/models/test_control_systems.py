@@ -181,7 +181,7 @@ def test_pinv_equals_numpy_and_the_four_rules():
 
 @pytest.mark.parametrize("sizes", [(5, 2), (4, 1), (6, 3), (3, 3)])
 def test_zeros_of_square_systems_equal_python_control(sizes):
-    """With D as many zeros as states, without as many as states without ports."""
+    """With D as many zeros as states, without it fewer by the number of ports."""
     states, ports = sizes
     system = random_system(states, ports, ports, seed=7)
     for d in (system.d, 0 * system.d):

@@ -301,8 +301,9 @@ def _riccati(a: Array, b: Array, q: Array, r: Array, n: Array, is_discrete: bool
     growth, doubt = _growth(hidden, a, is_discrete, eps)
     _refuse_modes(hidden.values[np.abs(growth) <= doubt], words.undamped)
     solve = solve_discrete_are if is_discrete else solve_continuous_are
+    unit = 1 / np.sqrt(np.diag(r))  # of each input: SciPy takes weights of very different units for singular
     try:
-        solution = solve(a, b, q, r, s=n)
+        solution = solve(a, b * unit, q, unit[:, None] * r * unit, s=n * unit)
     except LinAlgError as error:
         raise ValueError(f"the Riccati equation has no stabilizing solution to be found: {error}") from None
     return (solution + solution.T) / 2
@@ -322,7 +323,8 @@ def _split(a: Array, b: Array, eps: float) -> tuple[Array, _Modes]:
     eigenvalues: they are known to the root of the precision only.
     """
     states = len(a)
-    basis, fresh = np.zeros((states, 0)), _orth(b, _tolerance(b, eps))
+    directions = _unit_columns(b)
+    basis, fresh = np.zeros((states, 0)), _orth(directions, _tolerance(directions, eps))
     while fresh.shape[1]:
         basis = np.hstack([basis, fresh])
         fresh = a @ fresh
@@ -367,8 +369,7 @@ def _range(q: Array, whole: Array, eps: float) -> Array:
     scale = np.sqrt(np.where(diagonal > 10 * len(q) * eps * np.diag(whole), diagonal, 0.0))
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
     values, vectors = np.linalg.eigh(inverse[:, None] * q * inverse)
-    columns = scale[:, None] * vectors[:, values > 10 * len(q) * eps]
-    return columns / np.linalg.norm(columns, axis=0)
+    return scale[:, None] * vectors[:, values > 10 * len(q) * eps]
 
 
 # Parts ----------------------------------------------------------------------------------------------------------------
@@ -377,6 +378,12 @@ def _range(q: Array, whole: Array, eps: float) -> Array:
 def _tolerance(matrix: Array, eps: float) -> float:
     """What counts as zero beside a matrix."""
     return 10 * max(matrix.shape) * eps * float(np.linalg.norm(matrix, 1)) if matrix.size else 0.0
+
+
+def _unit_columns(matrix: Array) -> Array:
+    """Columns of length one, but those that are zero: the unit of an input plays no part in what it reaches."""
+    length = np.linalg.norm(matrix, axis=0)
+    return matrix / np.where(length > 0, length, 1.0)
 
 
 def _orth(matrix: Array, tolerance: float) -> Array:
