@@ -62,6 +62,25 @@ def data():
     return ys
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        tf.KalmanFilter,
+        tf.ExtendedKalmanFilter,
+        tf.ErrorStateKalmanFilter,
+        tf.UnscentedKalmanFilter,
+        tf.CubatureKalmanFilter,
+        tf.GaussHermiteKalmanFilter,
+    ],
+)
+def test_every_gaussian_filter_takes_a_gate(make):
+    ys = torch.from_numpy(data())
+    history = make(walk(), gate=tf.Gate(0.99, -3.0))(ys)
+    plain = tf.GaussianFilter(walk(), taylor(), gate=tf.Gate(0.99, -3.0))(ys)
+    assert torch.equal(history.diagnostics.accepted, plain.diagnostics.accepted) and history.evidence == "approximate"
+    torch.testing.assert_close(history.mean, plain.mean, rtol=0, atol=1e-12)
+
+
 def test_each_sensor_is_tested_on_its_own():
     ys = data()
     tracker = tf.GaussianFilter(walk(), taylor(), gate=tf.Gate(0.99, -3.0))
@@ -128,6 +147,7 @@ def test_the_log_of_decisions():
         (lambda: tf.Gate(1.0), ValueError, r"gate must be a probability in \(0, 1\) or None, got 1.0"),
         (lambda: tf.Gate(0.9, math.inf), ValueError, "outlier_log_density must be finite, got inf"),
         (lambda: tf.Gate(0.9, {"a": math.nan}), ValueError, "outlier_log_density must be finite, got nan"),
+        (lambda: tf.Gate(sensors="beacon"), TypeError, r"sensors must be names, such as \('beacon',\)"),
         (lambda: tf.GaussianFilter(walk(), taylor(), gate="a"), TypeError, "gate must be a Gate, .* got str"),
         (lambda: tf.GaussianFilter(walk(), taylor(), gate=True), TypeError, "gate must be a Gate, .* got bool"),
         (lambda: tf.LocallyLinearizedParticleFilter(walk(), gate=tf.Gate()), ValueError, "needs outlier_log_density"),

@@ -29,6 +29,7 @@ class Gate:
     Raises:
         ValueError: a probability outside (0, 1), a density that is not finite; when used, names that the law does not
             have.
+        TypeError: one name in place of several.
     """
 
     probability: float = 0.999
@@ -38,6 +39,8 @@ class Gate:
     def __post_init__(self) -> None:
         if not 0 < self.probability < 1:
             raise ValueError(f"gate must be a probability in (0, 1) or None, got {self.probability}")
+        if isinstance(self.sensors, str):
+            raise TypeError(f"sensors must be names, such as ({self.sensors!r},), got a single one")
         density = self.outlier_log_density
         for value in density.values() if isinstance(density, Mapping) else [] if density is None else [density]:
             if not -float("inf") < value < float("inf"):

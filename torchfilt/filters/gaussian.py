@@ -106,8 +106,8 @@ class GaussianFilter(Filter[Gaussian]):
         return posterior, info
 
 
-def KalmanFilter(model: StateSpaceModel) -> GaussianFilter:
-    """Exact filter for linear-Gaussian models, square-root form.
+def KalmanFilter(model: StateSpaceModel, gate: Gate | float | None = None) -> GaussianFilter:
+    """Exact filter for linear-Gaussian models, square-root form; ``gate`` as in `GaussianFilter`.
 
     Raises:
         TypeError: a law that does not give its `linear_form`.
@@ -122,15 +122,19 @@ def KalmanFilter(model: StateSpaceModel) -> GaussianFilter:
                 f"KalmanFilter needs linear laws; {name} is a {type(law).__name__} without linear_form. "
                 "Take ExtendedKalmanFilter or UnscentedKalmanFilter"
             )
-    return GaussianFilter(model, taylor())
+    return GaussianFilter(model, taylor(), gate=gate)
 
 
-def ExtendedKalmanFilter(model: StateSpaceModel, iterations: int = 1) -> GaussianFilter:
+def ExtendedKalmanFilter(
+    model: StateSpaceModel, iterations: int = 1, gate: Gate | float | None = None
+) -> GaussianFilter:
     """First-order linearisation with exact derivatives; ``iterations`` > 1 is the iterated form.
+
+    Other arguments as in `GaussianFilter`.
 
     Source: Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE TAC 38 (1993).
     """
-    return GaussianFilter(model, taylor(), iterations)
+    return GaussianFilter(model, taylor(), iterations, gate)
 
 
 def ErrorStateKalmanFilter(
@@ -185,11 +189,21 @@ def UnscentedKalmanFilter(
     return GaussianFilter(model, unscented(alpha, beta, kappa), iterations, gate)
 
 
-def CubatureKalmanFilter(model: StateSpaceModel, iterations: int = 1) -> GaussianFilter:
-    """Third-degree spherical-radial cubature, 2e points. Source: Arasaratnam and Haykin, IEEE TAC 54 (2009)."""
-    return GaussianFilter(model, cubature(), iterations)
+def CubatureKalmanFilter(
+    model: StateSpaceModel, iterations: int = 1, gate: Gate | float | None = None
+) -> GaussianFilter:
+    """Third-degree spherical-radial cubature, 2e points; arguments as in `GaussianFilter`.
+
+    Source: Arasaratnam and Haykin, Cubature Kalman filters, IEEE TAC 54 (2009).
+    """
+    return GaussianFilter(model, cubature(), iterations, gate)
 
 
-def GaussHermiteKalmanFilter(model: StateSpaceModel, order: int = 3, iterations: int = 1) -> GaussianFilter:
-    """Product Gauss-Hermite quadrature, order ** e points. Source: Ito and Xiong, IEEE TAC 45 (2000)."""
-    return GaussianFilter(model, gauss_hermite(order), iterations)
+def GaussHermiteKalmanFilter(
+    model: StateSpaceModel, order: int = 3, iterations: int = 1, gate: Gate | float | None = None
+) -> GaussianFilter:
+    """Product Gauss-Hermite quadrature, order ** e points; other arguments as in `GaussianFilter`.
+
+    Source: Ito and Xiong, Gaussian filters for nonlinear filtering problems, IEEE TAC 45 (2000).
+    """
+    return GaussianFilter(model, gauss_hermite(order), iterations, gate)
