@@ -255,6 +255,19 @@ def test_ranks_of_an_ins_over_manoeuvres(case, time_scale):
         assert wanted == 15 or float(values[wanted]) < 0.1 * float(found.tolerance)
 
 
+def test_earths_rate_adds_one_weak_direction_to_level_flight():
+    spin = 7.292e-5 * np.array([0.0, math.cos(0.8), math.sin(0.8)])
+    for sensors, wanted in ((("position",), 12), (("position", "heading"), 13)):
+        a, c = flight("level", sensors=sensors)[0]
+        a = a.clone()
+        a[:3, :3] -= torch.as_tensor(skewed(spin))
+        a[3:6, 3:6] -= torch.as_tensor(skewed(2 * spin))
+        found = rank(obsv(a, c), scale=INS_ERROR_SCALE)
+        assert int(found.rank) == wanted
+        if wanted == 12:
+            assert float(found.singular_values[11]) < 1e-4 * float(found.singular_values[10])
+
+
 def test_matrices_of_manoeuvres_are_what_numpy_stacks():
     pieces, times = flight("level", "acceleration", "turn"), (4.0, 7.0)
     past, stripped, total = np.eye(15), [], []
@@ -413,6 +426,28 @@ def test_a_report_names_what_is_not_observed_and_how():
     assert len(ratio) == 1 and ("9.807" in ratio[0] or "0.102" in ratio[0])
     for name in INS_ERROR_NAMES:
         assert name in text
+
+
+def test_a_report_in_single_precision_names_the_same_states():
+    a, c = (part.float() for part in flight("level")[0])
+    report = observability_report(obsv(a, c), INS_ERROR_NAMES, scale=INS_ERROR_SCALE)
+    double = observability_report(obsv(*flight("level")[0]), INS_ERROR_NAMES, scale=INS_ERROR_SCALE)
+    assert report.share.dtype == torch.float32 and report.rank == 11
+    assert report.unobserved == double.unobserved
+    assert np.allclose(report.directions, double.directions, rtol=1e-4, atol=1e-6)
+
+
+def test_a_table_leaves_out_what_does_not_weigh():
+    """In the states' sizes, not in their units: a bias of 0.02 weighs more beside sizes of 0.1 than 1 beside 100."""
+    matrix = row(0.02, -1.0, 0.0) * 1.0
+    scale = torch.tensor([1.0, 1.0, 1.0], dtype=DOUBLE)
+    text = observability_report(matrix, ("x", "v", "b"), scale=scale).table()
+    assert "  +1 x" in text.splitlines()  # and 0.02 v, a fiftieth
+    heavy = observability_report(matrix, ("x", "v", "b"), scale=torch.tensor([10.0, 1.0, 1.0], dtype=DOUBLE))
+    assert "  +1 x  +0.02 v" in heavy.table().splitlines() or "  +50 x  +1 v" in heavy.table().splitlines()
+    assert heavy.sizes.tolist() == [10.0, 1.0, 1.0]
+    assert np.allclose(observability_report(matrix, "xvb", scale="columns").sizes, [50.0, 1.0, 1.0])
+    assert observability_report(matrix, "xvb").sizes.tolist() == [1.0, 1.0, 1.0]
 
 
 def test_shares_and_directions_against_a_projection_by_numpy():

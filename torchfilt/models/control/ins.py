@@ -3,6 +3,10 @@
 Over flat ground that does not turn, in level axes that turn with the heading (right, forward, up): seen from there, a
 straight flight, an acceleration and a level turn are each constant, so a flight is piecewise constant without
 approximation, and the state does not jump where one piece meets the next.
+
+With position fixes level flight shows 11 of the 15 errors, 13 with a heading; with an acceleration after it 14, with a
+turn after it 15. The Earth's rate, left out here, would show the gyro's bias about up in level flight too (12), with a
+singular value four orders below the others in steps of a second.
 """
 
 import math

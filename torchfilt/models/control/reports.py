@@ -12,9 +12,8 @@ from torchfilt.models.control.observability import Scale, rank, scale_columns
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_PART = 1e-6
-"""Share of a unit direction below which a state has no part in it: far above rounding, far below anything of use."""
 _SHOWN = 0.05
+"""Parts of a direction that a table shows, of its largest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +38,8 @@ class ObservabilityReport:
     @property
     def unobserved(self) -> tuple[str, ...]:
         """Names of the states that take part in a direction that is not observed."""
-        return tuple(name for name, share in zip(self.names, self.share.tolist(), strict=True) if 1 - share > _PART)
+        least = _least(self.share)
+        return tuple(name for name, share in zip(self.names, self.share.tolist(), strict=True) if 1 - share > least)
 
     def table(self) -> str:
         """Text: rank and what it was decided from, the share of each state, the directions that are not observed."""
@@ -100,6 +100,11 @@ def observability_report(
     )
 
 
+def _least(like: Tensor) -> float:
+    """Share of a unit direction up to which a state has no part in it: above rounding, below anything of use."""
+    return max(1e-6, 100 * torch.finfo(like.dtype).eps)
+
+
 def _sizes(matrix: Tensor, scale: Scale) -> Tensor:
     """What `scale_columns` multiplied each column by."""
     if isinstance(scale, Tensor):
@@ -122,7 +127,7 @@ def _reduced(basis: Tensor) -> Tensor:
     """The same space by rows that are easy to read: each leader in one of them only, what rounding left set to zero."""
     leaders = _leaders(basis)
     rows = torch.linalg.solve(basis[:, leaders], basis)
-    return torch.where(rows.abs() > _PART, rows, 0)
+    return torch.where(rows.abs() > _least(rows), rows, 0)
 
 
 def _span(values: list[float]) -> str:
