@@ -189,8 +189,12 @@ def test_readings_on_another_surface_are_refused():
     level = torch.from_numpy(generator.uniform(-2, 2, (200, 2)))
     hyperboloid = torch.cat([level, (1 + level.square().sum(-1, keepdim=True)).sqrt()], -1)
     hyperboloid[::2, 2] *= -1
-    with pytest.raises(ValueError, match="samples do not lie on an ellipsoid"):
+    with pytest.raises(ValueError, match="samples do not lie on an ellipsoid: the quadric"):
         fit_iron(hyperboloid, 1.0)
+    # A blob whose quadric is an ellipsoid, but not the nearest one.
+    blob = torch.randn(20, 3, generator=torch.Generator().manual_seed(44), dtype=DOUBLE)
+    with pytest.raises(ValueError, match="samples do not lie on an ellipsoid: the fit does not converge"):
+        fit_iron(blob, 1.0)
 
 
 def test_fit_refuses():
