@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 import torchfilt as tf
 from torchfilt import delays
@@ -215,6 +216,24 @@ def test_controls_of_a_split_step(split):
     np.testing.assert_allclose(state.belief.covariance, covariance, rtol=1e-12)
 
 
+@pytest.mark.parametrize("fraction", [0.2, 0.5, 0.9])
+def test_the_share_of_compensated_increments_is_wrong_by_an_eighth_of_their_product(fraction):
+    """Against the integral of a force that turns with the body at a constant rate, by a fine sum over rotations."""
+    rate, force, dt = np.array([0.3, -0.2, 0.5]), np.array([1.0, 2.0, 9.0]), 0.02
+
+    def push(span):
+        middles = (np.arange(2000) + 0.5) / 2000 * span
+        return Rotation.from_rotvec(np.outer(middles, rate)).apply(force).mean(0) * span
+
+    bound = np.linalg.norm(np.cross(rate * dt, push(dt))) / 8
+    for part in (fraction, 1 - fraction):
+        share = proportional(tensor(push(dt)), part).numpy()
+        error = np.linalg.norm(share - push(part * dt))
+        # s (1 - s) / 2 of the product, but for terms of the third order: the turn is 0.012 rad.
+        assert error < bound * 1.02
+        np.testing.assert_allclose(error, 4 * part * (1 - part) * bound, rtol=0.02)
+
+
 def test_a_callable_is_asked_for_each_part():
     asked = []
 
@@ -241,6 +260,13 @@ def test_constraints_enter_each_step_once():
     constraint = [(t, 1, 1.5, 0.5) for t in (0.1, 0.15, 0.2)]
     expected, _, _ = batch_answer(0.2, [(0.1, 0, 1.0, POSITION_SD), (0.15, 0, 1.0, POSITION_SD), *constraint])
     np.testing.assert_allclose(state.belief.mean, expected, rtol=1e-11)
+    # Left out of a step on purpose, it does not come in with a late measurement by another sensor.
+    free, _ = wrapper.step(state, {"still": None}, dt=0.1)
+    free, _ = wrapper.late(free, {"speed": tensor([2.0])}, 0.3)
+    expected, _, _ = batch_answer(
+        0.3, [(0.1, 0, 1.0, POSITION_SD), (0.15, 0, 1.0, POSITION_SD), *constraint, (0.3, 1, 2.0, SPEED_SD)]
+    )
+    np.testing.assert_allclose(free.belief.mean, expected, rtol=1e-11)
 
 
 def test_what_is_given_is_left_alone_and_may_be_used_again():
@@ -253,14 +279,12 @@ def test_what_is_given_is_left_alone_and_may_be_used_again():
     buffer.fill_(99.0), push.fill_(99.0)
     other, _ = wrapper.late(state, {"speed": tensor([2.0])}, 0.1)
     assert torch.equal(one.belief.mean, other.belief.mean) and len(state.past) == 2
-    value = tensor([NAN, 2.0])
-    third, _ = wrapper.late(state, value, 0.1)
-    fourth, _ = wrapper.late(state, tensor([NAN, 2.0]), 0.05)
+    value = tensor([NAN, 2.0])  # makes a step of its own at 0.05 s, which is run again later
+    third, _ = wrapper.late(state, value, 0.05)
     value.fill_(99.0)
     again, _ = wrapper.late(third, {"position": tensor([1.0])}, 0.05)
-    order, _ = wrapper.late(wrapper.late(state, {"position": tensor([1.0])}, 0.05)[0], {"speed": tensor([2.0])}, 0.1)
-    assert torch.equal(third.belief.mean, one.belief.mean) and torch.equal(again.belief.mean, order.belief.mean)
-    assert not torch.equal(fourth.belief.mean, one.belief.mean)
+    order, _ = wrapper.late(state, {"position": tensor([1.0]), "speed": tensor([2.0])}, 0.05)
+    assert torch.equal(again.belief.mean, order.belief.mean)
 
 
 def test_gradients_pass_through_the_way_back():
