@@ -60,7 +60,7 @@ LAYERS = [
     ["proposals", "moves", "models"],
     ["run", "rao_blackwell"],
     ["filters"],
-    ["smoothing", "robust", "delays", "metrics"],
+    ["smoothing", "robust", "delays", "modes", "metrics"],
     ["learning", "report", "io", "testing"],
     ["missions"],
 ]

@@ -28,6 +28,7 @@ from torchfilt.laws import AdditiveGaussian, LinearGaussian
 from torchfilt.lazy import lazy_names
 from torchfilt.mixture import InitialMixture, MixtureLaw, split_gaussian
 from torchfilt.model import StateSpaceModel
+from torchfilt.modes import Mode, NavigationModes, Switch
 from torchfilt.noise import NoiseSource
 from torchfilt.particles import Particles
 from torchfilt.robust import Reacquire
@@ -67,6 +68,8 @@ __all__ = [
     "LinearGaussian",
     "LocallyLinearizedParticleFilter",
     "MixtureLaw",
+    "Mode",
+    "NavigationModes",
     "NoiseSource",
     "ParticleFilter",
     "Particles",
@@ -80,6 +83,7 @@ __all__ = [
     "StateSpaceModel",
     "StepInfo",
     "StepNoise",
+    "Switch",
     "UnitQuaternion",
     "UnscentedKalmanFilter",
     "UnscentedParticleFilter",

@@ -21,7 +21,7 @@ from torchfilt.sensors import PseudoMeasurement, Sensors
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
 from torchfilt.storage import NOT_OURS, IntegrityError, read_verified, write_verified
 from torchfilt.symmetry import GaugedTransition
-from torchfilt.types import B, FilterState, Guarded, Step, StepInfo
+from torchfilt.types import B, FilterState, Guarded, Moded, Step, StepInfo
 
 Split = Callable[[Tensor, float], Tensor]
 Action = Literal["on time", "joined", "inserted", "replaced", "skipped"]
@@ -35,8 +35,8 @@ def held(u: Tensor, fraction: float) -> Tensor:
 def proportional(u: Tensor, fraction: float) -> Tensor:
     """Control of a part of a step where u is an increment over it, such as an angle turned: its share, fraction * u.
 
-    Compensated inertial increments (dtheta, dv) are so to first order: dv of the second part stays in the axes at the
-    start of the whole, an error of half the product of turn and push.
+    Raw inertial increments are so at constant rate and force. Compensated ones (dtheta, dv) are so to first order: dv
+    of each part, in axes at its own start, is wrong by at most an eighth of the cross product of dtheta and dv.
     """
     return fraction * u
 
@@ -435,7 +435,18 @@ class DelayedMeasurements(nn.Module, Generic[B]):
 
 FILE_KIND = "torchfilt stream"
 # All that a state is made of; nothing else is ever unpickled.
-_PARTS: list[Any] = [DelayedState, TakenStep, Arrival, FilterState, Gaussian, Particles, Centre, PastStep, Guarded]
+_PARTS: list[Any] = [
+    DelayedState,
+    TakenStep,
+    Arrival,
+    FilterState,
+    Gaussian,
+    Particles,
+    Centre,
+    PastStep,
+    Guarded,
+    Moded,
+]
 _PARTS += [Euclidean, Angle, UnitQuaternion, Product]
 
 

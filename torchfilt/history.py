@@ -11,7 +11,7 @@ from torchfilt.gaussian import Gaussian
 from torchfilt.particles import Particles, PastStep
 from torchfilt.spaces import EUCLIDEAN, Angle, Euclidean, Product, Space, UnitQuaternion
 from torchfilt.storage import NOT_OURS, IntegrityError, read_arrays, write_arrays
-from torchfilt.types import FilterState, Guarded, StepInfo, trusted
+from torchfilt.types import FilterState, Guarded, Moded, StepInfo, trusted
 
 FILE_KIND = "torchfilt history"
 
@@ -103,6 +103,9 @@ class History:
             fallback, head["guarded"] = self.final.belief.fallback, True
             parts |= {"fallback.mean": fallback.mean, "fallback.scale_tril": fallback.scale_tril}
             parts["refused_s"] = self.final.belief.refused_s
+        if isinstance(self.final.belief, Moded):
+            head["moded"] = True
+            parts |= {"mode": self.final.belief.mode, "since_s": self.final.belief.since_s}
         if isinstance(final, Particles):  # made on another way than from log_weights they differ in the last bit
             parts["final.weights"] = final.weights
             head["past"] = [_past_to_plain(part, f"final.past.{k}", parts) for k, part in enumerate(final.past)]
@@ -124,6 +127,8 @@ class History:
             if head.get("guarded"):
                 fallback = Gaussian(tensors["fallback.mean"], tensors["fallback.scale_tril"], space)
                 final = Guarded(final, fallback, tensors["refused_s"])
+            if head.get("moded"):
+                final = Moded(final, tensors["mode"], tensors["since_s"])
             recorded = {name for name in tensors if name.startswith("beliefs.")}
             beliefs = _belief(tensors, "beliefs", head, space) if recorded else None
             optional: dict[str, Any] = {name: tensors.get(f"info.{name}") for name in StepInfo._fields[2:]}

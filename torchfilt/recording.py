@@ -9,7 +9,7 @@ from torch import Tensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.history import History
 from torchfilt.particles import Particles
-from torchfilt.types import FilterState, Guarded, StepInfo, trusted
+from torchfilt.types import Belief, FilterState, StepInfo, trusted
 
 Record = Literal["mean", "moments", "beliefs"]
 # Below so many numbers a step, keeping references and stacking them at the end takes fewer calls than copying at once.
@@ -104,7 +104,7 @@ class Recorder:
         self.series: dict[str, Series] = {}
         self.at_once = False
 
-    def add(self, belief: Gaussian | Particles | Guarded, info: StepInfo) -> None:
+    def add(self, belief: Belief, info: StepInfo) -> None:
         """Take in one step."""
         belief = trusted(belief)
         if not self.series and isinstance(belief, Particles):

@@ -14,7 +14,7 @@ from torchfilt.history import History
 from torchfilt.moments import Rule, check_rule_type, unscented
 from torchfilt.particles import Particles
 from torchfilt.run import Filter
-from torchfilt.types import FilterState, Guarded, Missing, Step, StepInfo, StepNoise
+from torchfilt.types import FilterState, Guarded, Missing, Step, StepInfo, StepNoise, choose
 
 __all__ = ["Decision", "Gate", "Reacquire", "decisions"]
 
@@ -115,7 +115,7 @@ class Reacquire(Filter[Guarded]):
             fresh = self._start(fallback, noise)
             only = torch.where(watched, y, torch.nan)
             fresh, told = own.advance(fresh, only, u, dt, noise, "rows", False)
-            after = _choose(again, fresh, after)
+            after = choose(again, fresh, after)
             info = info._replace(
                 log_likelihood=torch.where(again, told.log_likelihood, info.log_likelihood),
                 ok=torch.where(again, told.ok, info.ok),
@@ -131,18 +131,6 @@ class Reacquire(Filter[Guarded]):
             return fallback
         assert noise is not None and noise.restart is not None
         return self.filter.around(fallback, noise.restart)
-
-
-def _choose(rows: Tensor, yes: Any, no: Any) -> Any:
-    """Beliefs of ``yes`` in the rows (*batch) that are set, of ``no`` in the others."""
-
-    def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(rows.reshape(*rows.shape, *[1] * (b.dim() - rows.dim())), a, b)
-
-    if isinstance(no, Gaussian):
-        return Gaussian(pick(yes.mean, no.mean), pick(yes.scale_tril, no.scale_tril), no.space)
-    factor = None if no.scale_tril is None else pick(yes.scale_tril, no.scale_tril)
-    return Particles(pick(yes.x, no.x), pick(yes.log_weights, no.log_weights), factor, no.space)
 
 
 class Decision(NamedTuple):

@@ -11,9 +11,8 @@ from torchfilt.history import History
 from torchfilt.model import StateSpaceModel
 from torchfilt.particles import Particles
 from torchfilt.recording import Record, Recorder
-from torchfilt.types import B, FilterError, FilterState, Guarded, Missing, Step, StepInfo, StepNoise, trusted
+from torchfilt.types import B, Belief, FilterError, FilterState, Missing, Step, StepInfo, StepNoise, trusted
 
-Belief = Gaussian | Particles | Guarded
 Evidence = Literal["exact", "unbiased", "linearized", "approximate"]
 
 
@@ -31,7 +30,7 @@ class Filter(nn.Module, Generic[B]):
     """
 
     evidence: Evidence = "exact"
-    carries: type[Gaussian] | type[Particles] | type[Guarded]
+    carries: type[Belief]
 
     def __init__(self, model: StateSpaceModel) -> None:
         super().__init__()

@@ -1,7 +1,8 @@
 """What filters carry, what a step is given and what it reports."""
 
-from typing import Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
+import torch
 from torch import Tensor
 
 from torchfilt.gaussian import Gaussian
@@ -38,12 +39,51 @@ class Guarded(NamedTuple):
         return self.belief.covariance
 
 
-B = TypeVar("B", Gaussian, Particles, Guarded)
+class Moded(NamedTuple):
+    """A belief with the mode that navigation is in; what `NavigationModes` carries.
+
+    mode (*batch): index of the mode. since_s (*batch): for how long.
+    """
+
+    belief: Gaussian | Particles
+    mode: Tensor
+    since_s: Tensor
+
+    @property
+    def space(self) -> Space:
+        """Where the state lives."""
+        return self.belief.space
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean (*batch, d) of the belief."""
+        return self.belief.mean
+
+    @property
+    def covariance(self) -> Tensor:
+        """Covariance (*batch, e, e) of the belief."""
+        return self.belief.covariance
 
 
-def trusted(belief: Gaussian | Particles | Guarded) -> Gaussian | Particles:
+Belief = Gaussian | Particles | Guarded | Moded
+B = TypeVar("B", Gaussian, Particles, Guarded, Moded)
+
+
+def trusted(belief: Belief) -> Gaussian | Particles:
     """The belief itself, without what stands beside it."""
-    return belief.belief if isinstance(belief, Guarded) else belief
+    return belief.belief if isinstance(belief, Guarded | Moded) else belief
+
+
+def choose(rows: Tensor, yes: Any, no: Any) -> Any:
+    """Beliefs of ``yes`` in the rows (*batch) that are set, of ``no`` in the others; Gaussians or particles."""
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(rows.reshape(*rows.shape, *[1] * (b.dim() - rows.dim())), a, b)
+
+    if isinstance(no, Gaussian):
+        return Gaussian(pick(yes.mean, no.mean), pick(yes.scale_tril, no.scale_tril), no.space)
+    factor = None if no.scale_tril is None else pick(yes.scale_tril, no.scale_tril)
+    return Particles(pick(yes.x, no.x), pick(yes.log_weights, no.log_weights), factor, no.space)
 
 
 class FilterState(NamedTuple, Generic[B]):
@@ -61,7 +101,8 @@ class StepInfo(NamedTuple):
     (*batch, e_y) and its factor (*batch, e_y, e_y), or (e_y, e_y) where all rows share it; ancestors (*batch, n).
     accepted, gate_nis (*batch), with `Sensors` (*batch, sensors): what a gate took in, in a bank by the heavier half of
     its members, and the squared innovation it was told by, in a bank their weighted mean. restarted (*batch): by
-    `Reacquire`. A history stacks them along time.
+    `Reacquire`. mode, switch (*batch): by `NavigationModes`, the mode that took the step in and which of the switches
+    ended it, -1 for none. A history stacks them along time.
     evidence says what log_likelihood is, see `torchfilt.run.Filter`: "approximate" where the form biases it.
     """
 
@@ -76,6 +117,8 @@ class StepInfo(NamedTuple):
     accepted: Tensor | None = None
     gate_nis: Tensor | None = None
     restarted: Tensor | None = None
+    mode: Tensor | None = None
+    switch: Tensor | None = None
     particles: Tensor | None = None
     evidence: str | None = None
 
