@@ -15,7 +15,16 @@ NAMES = sorted(path.stem for path in SCRIPTS.glob("*.py") if not path.stem.start
 
 
 def test_there_is_a_script_for_each_part() -> None:
-    assert NAMES == ["demo", "run_attitude", "run_formation", "run_grace", "run_inertial", "run_landing", "train_gp"]
+    assert NAMES == [
+        "demo",
+        "run_attitude",
+        "run_formation",
+        "run_grace",
+        "run_height",
+        "run_inertial",
+        "run_landing",
+        "train_gp",
+    ]
 
 
 @pytest.mark.parametrize("name", NAMES)

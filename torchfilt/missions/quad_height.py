@@ -1,8 +1,8 @@
 """Height of a multirotor from inertial sensors, a barometer that drifts and a range finder that may be withheld.
 
 Two stages. An attitude filter (gyro, and specific force as "up" with a wide deviation) turns specific force upright;
-the heading does not enter. Then a linear Kalman filter of the vertical channel: height above ground, velocity up, bias of
-the upward force, and what the barometer reads too much. Four filters differ in that last part only:
+the heading does not enter. Then a linear Kalman filter of the vertical channel: height above ground, velocity up, bias
+of the upward force, and what the barometer reads too much. Four filters differ in that last part only:
 
 * ``inertial``: the barometer is not used.
 * ``fixed``: a constant offset; the noise of the barometer is as wide as its drift makes the likelihood want it.
@@ -130,8 +130,9 @@ class Flight(NamedTuple):
 
     time_s, dt_s (k,). quaternion (k, 4): attitude at the end, body to a world whose third axis is up, heading free.
     control (k, 2): increment of velocity up, m/s, gravity taken off, and the deviation of its noise. range_height_m
-    (k,): range times cosine of tilt, NaN where silent. baro_m (k,). witness (k, 2): on-board height, m, and the receiver's
-    velocity up, m/s; no filter sees them. withheld (k, R). ends: (row, first step, last step, gap in s) of each gap.
+    (k,): range times cosine of tilt, NaN where silent. baro_m (k,). witness (k, 2): on-board height, m, and the
+    receiver's velocity up, m/s; no filter sees them. withheld (k, R). ends: (row, first step, last step, gap in s) of
+    each gap.
     """
 
     time_s: Tensor
@@ -342,7 +343,7 @@ def _gaps(stamp: Tensor, settings: HeightSettings) -> tuple[Tensor, list[tuple[i
 # Filters --------------------------------------------------------------------------------------------------------------
 
 
-def make_filter(name: str, flight: Flight, settings: HeightSettings) -> tf.KalmanFilter:
+def make_filter(name: str, flight: Flight, settings: HeightSettings) -> Any:
     """A filter that starts at rest at the first range, its barometer set to it; sensors ``range`` and ``baro``.
 
     Raises:
@@ -538,7 +539,7 @@ def _figures(results: dict[str, Arrays], flight: Flight, settings: HeightSetting
     figure, axes = new_figure(2, 1, (9, 6), sharex=True)
     top, low = axes[:, 0]
     top.set_title("Height, range finder withheld after settling; ±3 sigma", fontsize=9)
-    low.set_title("What the barometer reads too much, range finder in use; ±3 sigma", fontsize=9)
+    low.set_title("What the barometer reads too much, range finder in use", fontsize=9)
     raw = baro - np.interp(stamp, stamp[np.isfinite(height)], height[np.isfinite(height)])
     low.plot(stamp, raw, ".", ms=1, color=TRUTH, label="barometer less range")
     for colour, (name, result) in zip(COLOURS, results.items(), strict=False):
@@ -560,7 +561,7 @@ def _figures(results: dict[str, Arrays], flight: Flight, settings: HeightSetting
     figure, axes = new_figure(1, 1, (7, 4.5), "Height after a gap of the range finder, less its reading")
     for k, (name, result) in enumerate(results.items()):
         place = [gap_s * (1 + 0.05 * (k - len(results) / 2)) for *_, gap_s in flight.ends]
-        error = [_at_end(np.abs(result["mean"][:, row, 0] - height), stamp, last) for row, _, last, _ in flight.ends]
+        error = [abs(_at_end(result["mean"][:, row, 0] - height, stamp, last)) for row, _, last, _ in flight.ends]
         axes[0, 0].plot(place, error, ".", ms=4, alpha=0.6, color=COLOURS[k % len(COLOURS)], label=name)
     ax = axes[0, 0]
     ax.set_xscale("log")
