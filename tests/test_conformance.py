@@ -39,6 +39,7 @@ from torchfilt.models.relative_motion import (
     phase,
     simulate_formation,
 )
+from torchfilt.models.sensors import barometer, magnetometer, ultrasonic
 from torchfilt.moves import MetropolisHastings
 from torchfilt.resampling import Resampler, ess_below, kld_adaptive
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
@@ -205,6 +206,15 @@ LAWS = {
     "DescentMotion": (descent.DescentMotion(descent.DescentSettings(), 0.1), FALLING, normal(3, seed=32), None),
     "Descent Barometer": (descent.Barometer(87_000.0, 30.0, 0.05, 11), FALLING, None, None),
     "SpecificForce": (descent.SpecificForce(0.7), FALLING, None, None),
+    "BarometricAltimeter": (barometer.BarometricAltimeter(sd_pa=3.0, lagged=14, offset=15), HOVER, None, None),
+    "WithAltimeter": (
+        barometer.WithAltimeter(landing.LandingTransition(3e-4, 0.01), 0.4, 0.05),
+        torch.cat([HOVER, normal(4, 2, seed=31)], -1),
+        HOVER_PUSH,
+        0.025,
+    ),
+    "UltrasonicRange": (ultrasonic.UltrasonicRange(0.02, 0.01), HOVER, None, None),
+    "Magnetometer": (magnetometer.Magnetometer(normal(3, seed=24), 0.2, hard_iron_at=13), HOVER, None, None),
     "NavigationFixes": (NavigationFixes(position_sd_m=2.0, heading_sd_rad=0.1), STATES, None, None),
     "NavigationFixes all, with arms": (
         NavigationFixes(
@@ -271,7 +281,19 @@ def test_laws(name):
 def test_every_law_is_registered():
     """Modules of the package whose call gives a Gaussian: none may be left out."""
     laws = {type(law) for law, *_ in LAWS.values()}
-    models = (relative_motion, error_model, navigation, kinematics, landing, stars, descent, imu_mag)
+    models = (
+        relative_motion,
+        error_model,
+        navigation,
+        kinematics,
+        landing,
+        stars,
+        descent,
+        imu_mag,
+        barometer,
+        ultrasonic,
+        magnetometer,
+    )
     shipped = {
         member
         for module in (tf.laws, tf.sensors, tf.gp, *models)
