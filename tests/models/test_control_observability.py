@@ -209,6 +209,24 @@ def test_modes_of_systems_and_batches():
     assert pbh(discrete).undetectable.tolist() == [False, True]
 
 
+def test_modes_that_last_are_told_through_rounding():
+    """In mixed coordinates the eigenvalues of an integrator come out as plus and minus the root of eps."""
+    signs = set()
+    for seed in range(8):
+        mixed = normal(3, 3, seed=seed)
+        a = mixed @ torch.block_diag(CHAIN[:2, :2], torch.tensor([[-1.0]], dtype=DOUBLE)) @ torch.linalg.inv(mixed)
+        c = row(0.0, 1.0, 1.0) @ torch.linalg.inv(mixed)  # position unseen
+        found = pbh(a, c)
+        signs |= set(torch.sign(found.eigenvalues.real[found.unobservable]).tolist())
+        assert found.undetectable.sum() == 2
+        step = torch.linalg.matrix_exp(a)
+        assert pbh(step, c, discrete=True).undetectable.sum() == 2
+        still = mixed @ torch.diag(row(0.0, -1.0, -2.0)[0]) @ torch.linalg.inv(mixed)
+        with pytest.raises(ValueError, match="needs a stable system"):
+            observability_gramian(still, c)
+    assert {1.0, -1.0} <= signs
+
+
 # Manoeuvres -----------------------------------------------------------------------------------------------------------
 
 SPEED, RATE = 30.0, 0.1

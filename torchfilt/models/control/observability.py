@@ -199,7 +199,8 @@ def _forever(a: Tensor, weight: Tensor, discrete: bool) -> Tensor:
     from scipy import linalg
 
     eigenvalues = torch.linalg.eigvals(a.detach())
-    unstable = _lasting(eigenvalues, discrete)
+    margin = a.shape[-1] * torch.finfo(a.dtype).eps * torch.linalg.matrix_norm(a.detach(), 2)
+    unstable = _lasting(eigenvalues, discrete, margin)
     if unstable.any():
         rule = "|z| >= 1" if discrete else "Re >= 0"
         worst = eigenvalues[unstable][0].item()
@@ -219,9 +220,10 @@ def _forever(a: Tensor, weight: Tensor, discrete: bool) -> Tensor:
     return torch.stack(rows).reshape(*lead, size, size).to(a)
 
 
-def _lasting(eigenvalues: Tensor, discrete: bool) -> Tensor:
-    """Which modes do not die out."""
-    return eigenvalues.abs() >= 1 if discrete else eigenvalues.real >= 0
+def _lasting(eigenvalues: Tensor, discrete: bool, margin: Tensor) -> Tensor:
+    """Which modes do not die out, by more than rounding makes of a mode that lasts: margin (*batch)."""
+    growth = eigenvalues.abs() - 1 if discrete else eigenvalues.real
+    return growth >= -margin.unsqueeze(-1)
 
 
 # Modes ----------------------------------------------------------------------------------------------------------------
@@ -233,7 +235,9 @@ class Modes(NamedTuple):
     eigenvalues (*batch, d), complex; singular_values (*batch, d): the smallest of [lambda - a; c], zero where the mode
     never shows; directions (*batch, d, d), complex, a row a mode: the unit state that shows least; unobservable
     (*batch, d): singular value within the tolerance (*batch); undetectable (*batch, d): of these, the ones that last
-    (Re >= 0, or |z| >= 1): no observer can bring their error down.
+    (Re >= 0, or |z| >= 1, but for sqrt(eps) of the norm of a): no observer can bring their error down.
+
+    A mode that occurs k times is marked k times where one of its directions is not seen: count directions by `rank`.
     """
 
     eigenvalues: Tensor
@@ -267,13 +271,13 @@ def pbh(a: Any, c: Tensor | None = None, *, discrete: bool = False, tolerance: f
     else:
         limit = zero_below(a, a[..., 0], tolerance)
     eigenvalues = torch.linalg.eigvals(a)
+    margin = torch.finfo(a.dtype).eps ** 0.5 * torch.linalg.matrix_norm(a, 2)
     shifted = eigenvalues[..., None, None] * torch.eye(size, dtype=a.dtype, device=a.device) - a.unsqueeze(-3)
     tall = torch.cat([shifted, c.unsqueeze(-3).expand(*lead, size, *c.shape[-2:]).to(shifted.dtype)], -2)
     _, values, right = torch.linalg.svd(tall, full_matrices=False)
     unseen = values[..., -1] <= limit.unsqueeze(-1)
-    return Modes(
-        eigenvalues, values[..., -1], right[..., -1, :].conj(), unseen, unseen & _lasting(eigenvalues, discrete), limit
-    )
+    undetectable = unseen & _lasting(eigenvalues, discrete, margin)
+    return Modes(eigenvalues, values[..., -1], right[..., -1, :].conj(), unseen, undetectable, limit)
 
 
 # Arguments ------------------------------------------------------------------------------------------------------------
