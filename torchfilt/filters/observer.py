@@ -31,7 +31,8 @@ class LuenbergerObserver(Filter[Gaussian]):
 
     Covariance and likelihood are only claimed where the noise is known: with process_noise and measurement_noise the
     belief holds the true error covariance of this gain, best or not, from the prior's on; with C as it is and the model
-    true. Without them covariance and log-likelihood are NaN, and `ok` speaks of the mean alone.
+    true. Without them covariance and log-likelihood are NaN, and `ok` speaks of the mean alone. In continuous time the
+    log-likelihood is NaN in any case: an observer that never stops has no one innovation a step.
 
     Args:
         system: `StateSpace` or ``control.StateSpace``, one for all rows.
