@@ -276,3 +276,15 @@ def test_a_filter_sees_through_the_lag():
         ends.append(run(reading, control, dt=dt).mean[-1, 0, 9].item() - climb[-1].item())
     assert ends[0] == pytest.approx(-TAU, abs=0.05)
     assert abs(ends[1]) < 0.02
+
+
+def test_transition_compiles():
+    law, x = WithAltimeter(LANDING, TAU, 0.05), states(3)
+    found, slope = torch.compile(law.first_order, fullgraph=True, backend="eager")(x, CONTROL, STEPS)
+    expected = law.first_order(x, CONTROL, STEPS)
+    torch.testing.assert_close(found.mean, expected[0].mean)
+    torch.testing.assert_close(slope, expected[1])
+    rows = torch.func.vmap(lambda row: law(row, CONTROL, 0.3).mean)(x)
+    torch.testing.assert_close(rows, law(x, CONTROL, 0.3).mean)
+    single = law.first_order(x.float(), CONTROL.float(), STEPS.float())
+    assert single[0].mean.dtype == single[0].scale_tril.dtype == single[1].dtype == torch.float32
