@@ -497,6 +497,11 @@ def test_files_that_are_not_whole_are_refused(tmp_path):
     write_verified(path, (tmp_path / "other").read_bytes(), delays.FILE_KIND)
     with pytest.raises(IntegrityError, match="it holds a dict"):
         delays.load(path)
+    with (tmp_path / "other").open("wb") as file:
+        torch.save(tf.Gate(0.9), file)  # nothing but the parts of a state is ever made from a file
+    write_verified(path, (tmp_path / "other").read_bytes(), delays.FILE_KIND)
+    with pytest.raises(IntegrityError, match=r"not a stream of this version \(UnpicklingError\)"):
+        delays.load(path)
     with pytest.raises(FileNotFoundError):
         delays.load(tmp_path / "none")
     with pytest.raises(TypeError, match="state must be a DelayedState"):

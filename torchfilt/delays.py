@@ -475,7 +475,8 @@ def load(path: str | Path) -> DelayedState[Any]:
         with torch.serialization.safe_globals(_PARTS):
             state = torch.load(io.BytesIO(data), weights_only=True)
     except (*NOT_OURS, pickle.UnpicklingError, RuntimeError, IndexError) as error:
-        raise IntegrityError(f"{path}: not a stream of this version ({error})") from None
+        # Torch's own message is advice on how to trust the file nevertheless.
+        raise IntegrityError(f"{path}: not a stream of this version ({type(error).__name__})") from error
     if not isinstance(state, DelayedState):
         raise IntegrityError(f"{path}: not a stream of this version (it holds a {type(state).__name__})")
     return state
