@@ -9,7 +9,9 @@ from torchfilt.filters.gaussian import (
     KalmanFilter,
     UnscentedKalmanFilter,
 )
+from torchfilt.filters.lqg import LQGController
 from torchfilt.filters.mixture import GaussianSumFilter, InteractingMultipleModel
+from torchfilt.filters.observer import LuenbergerObserver, SteadyStateKalmanFilter
 from torchfilt.filters.particle import ParticleFilter
 from torchfilt.filters.particle_methods import (
     AuxiliaryParticleFilter,
@@ -32,11 +34,14 @@ __all__ = [
     "GaussianSumFilter",
     "InteractingMultipleModel",
     "KalmanFilter",
+    "LQGController",
     "LocallyLinearizedParticleFilter",
+    "LuenbergerObserver",
     "ParticleFilter",
     "RaoBlackwellizedParticleFilter",
     "RegularizedParticleFilter",
     "ResampleMoveParticleFilter",
+    "SteadyStateKalmanFilter",
     "UnscentedKalmanFilter",
     "UnscentedParticleFilter",
 ]

@@ -2,6 +2,6 @@
 
 from torchfilt.lazy import lazy_names
 
-__all__ = ["attitude", "inertial", "ode", "relative_motion", "sensors"]
+__all__ = ["attitude", "control", "inertial", "ode", "relative_motion", "sensors"]
 
 __getattr__, __dir__ = lazy_names(__name__, dict.fromkeys(__all__, ""), globals())

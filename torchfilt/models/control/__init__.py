@@ -1,5 +1,6 @@
 """Linear systems and their design: state space, discretisation, observers, Riccati equations."""
 
+from torchfilt.models.control.continuous import ContinuousLinear, ContinuousTransition, linear_model
 from torchfilt.models.control.design import (
     KalmanDesign,
     LqgDesign,
@@ -39,6 +40,9 @@ from torchfilt.models.control.systems import (
 )
 
 __all__ = [
+    "ContinuousLinear",
+    "ContinuousTransition",
+    "linear_model",
     "Empirical",
     "empirical_gramian",
     "INS_ERROR_NAMES",
