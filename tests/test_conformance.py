@@ -19,6 +19,7 @@ from torchfilt.kernels import Regularize
 from torchfilt.missions.attitude import descent, imu_mag, stars
 from torchfilt.models import landing, relative_motion
 from torchfilt.models.attitude import ATTITUDE_SPACE, GyroTransition, VectorMeasurement, kinematics
+from torchfilt.models.control import ContinuousLinear, ContinuousTransition, continuous, ss
 from torchfilt.models.inertial import error_model, navigation
 from torchfilt.models.inertial.earth import LocalMetres
 from torchfilt.models.inertial.error_model import InertialErrorFixes, InertialErrorTransition
@@ -257,6 +258,18 @@ LAWS = {
         None,
         None,
     ),
+    "ContinuousLinear": (
+        ContinuousLinear(normal(2, 2, seed=31), spd(1), normal(2, 1, seed=32), normal(2, 1, seed=33)),
+        X2,
+        normal(5, 1, seed=34),
+        torch.tensor([[0.1], [0.0], [2.0], [0.5], [0.1]], dtype=DOUBLE),
+    ),
+    "ContinuousTransition": (
+        ContinuousTransition(lambda x, u: x.roll(1, -1).sin() + u, spd(1), normal(2, 1, seed=32), steps=2),
+        X2,
+        normal(5, 2, seed=34),
+        torch.tensor([[0.1], [0.0], [2.0], [0.5], [0.1]], dtype=DOUBLE),
+    ),
     "GPTransition identity": (learned(), NEAR, None, None),
     "GPTransition next state": (learned("next_state", noise="latent"), NEAR, None, 10.0),
     "GPTransition residual": (learned("residual", ClohessyWiltshire(1.1e-3, 1e-9)), NEAR, None, 10.0),
@@ -290,6 +303,7 @@ def test_every_law_is_registered():
         stars,
         descent,
         imu_mag,
+        continuous,
         barometer,
         ultrasonic,
         magnetometer,
@@ -504,6 +518,15 @@ def test_gaussian_filters(name, model):
 
 def test_kalman_filter():
     check_filter(tf.KalmanFilter(LINEAR), MODELS["linear"][1])
+
+
+def test_filters_with_a_constant_gain():
+    matrix = LINEAR.transition.matrix
+    plant = ss(matrix, normal(2, 1), torch.eye(2, dtype=DOUBLE), dt=0.1)
+    observer = tf.LuenbergerObserver(plant, 0.3 * spd(2), LINEAR.prior(), 0.1 * spd(2), 0.3 * spd(2, seed=1))
+    check_filter(observer, MODELS["linear"][1], normal(6, 1), 0.1)
+    for settled in (True, False):
+        check_filter(tf.SteadyStateKalmanFilter(LINEAR, settled=settled), MODELS["linear"][1])
 
 
 # On quaternions each takes seconds; these few stand for the rest, which run with the slow tests.
