@@ -9,7 +9,7 @@ import run_landing
 import torch
 
 import torchfilt as tf
-from torchfilt.missions.landing import study
+from torchfilt.missions.landing import figures, study
 from torchfilt.missions.landing.scene import SCENARIOS, LandingSettings, make_scene
 from torchfilt.models.attitude import multiply
 
@@ -91,6 +91,39 @@ def test_a_turned_belief_is_as_consistent():
     error, nees = study.compare(scene, tf.Gaussian(level, spread, prior.space, True), near)[1:]
     expected = sum(float(e / d) ** 2 for k, (e, d) in enumerate(zip(error[0], spread, strict=True)) if k != 2)
     assert nees.item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_vehicle_that_sees_the_beacon_at_once_is_timed_from_its_start(monkeypatch):
+    """The clock begins ten steps before the first sight; where there are none, not at the other end of the flight."""
+    heard = []
+
+    class Listener:
+        def init(self, batch_shape, seed):
+            return "prior"
+
+        def step(self, state, y, *_, **__):
+            heard.append(y)
+            return state, None
+
+    monkeypatch.setattr(study, "make_filter", lambda name, scene: Listener())
+    seeds = make_scene(LandingSettings(runs=200, duration_s=11.0)).acquired
+    settings = LandingSettings(runs=1, seed=int(seeds.argmin()))
+    scene = make_scene(settings)
+    assert scene.acquired.item() < 10
+    study.time_one_vehicle("ukf", settings, steps=30)
+    torch.testing.assert_close(torch.stack(heard), scene.measurements[:30], rtol=0, atol=0, equal_nan=True)
+
+
+def test_figures_know_when_runs_end():
+    """Flights of 11 s: the clock since the first sight stops with the last run, and who is gone is not away."""
+    scene = make_scene(LandingSettings(runs=3, duration_s=11.0))
+    values = torch.arange(440.0, dtype=torch.float64)[:, None].expand(440, 3).numpy()
+    seconds, shifted = figures._since_sight(values, scene)
+    early, late = int(scene.acquired.min()), int(scene.acquired.max())
+    assert seconds[-1] == pytest.approx((439 - early) * scene.dt)
+    assert seconds[0] == pytest.approx(-min(2.0, late * scene.dt))
+    assert np.isfinite(shifted).any(1).all() and np.isnan(shifted[-1]).sum() == (scene.acquired > early).sum()
+    assert np.nanmax(np.abs(shifted - (seconds[:, None] / scene.dt + scene.acquired.numpy()))) < 1e-9
 
 
 def test_every_filter_can_be_made():

@@ -422,6 +422,7 @@ def test_model():
         (lambda: MOTION(states(2), None, 0.1), r"needs increments \(dtheta, dv\) as a control .* got none"),
         (lambda: MOTION(states(2), torch.zeros(2, 5), 0.1), r"got shape \(2, 5\)"),
         (lambda: MOTION(states(2), controls(2)), "needs the time step dt"),
+        (lambda: MOTION(states(2), controls(2), -0.1), "dt must be >= 0, got -0.1"),
         (lambda: Barometer(0.0), "sd_m must be one positive finite number, got 0.0"),
         (lambda: Beacon(math.nan), "sd_rad must be one positive finite number, got nan"),
         (lambda: Beacon(torch.ones(2)), "sd_rad must be one positive finite number"),

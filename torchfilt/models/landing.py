@@ -136,7 +136,7 @@ class LandingTransition(nn.Module):
 
     Raises:
         ValueError: a density that is negative or not one finite number; when called, no control or time step, a control
-            or state of another size.
+            or state of another size, a number below zero as a step.
 
     Source: Titterton and Weston, Strapdown Inertial Navigation Technology (2004), chapter 3, without Earth's rate.
     """
@@ -204,6 +204,8 @@ class LandingTransition(nn.Module):
             raise ValueError(f"this law needs increments (dtheta, dv) as a control u (..., {CONTROL_SIZE}), got {got}")
         if dt is None:
             raise ValueError("this law needs the time step dt over which the increments were taken")
+        if not isinstance(dt, Tensor) and not dt >= 0:
+            raise ValueError(f"dt must be >= 0, got {dt}")
         return _propagate(x, u, dt.squeeze(-1) if isinstance(dt, Tensor) and dt.dim() > 0 else dt)
 
     def _law(self, x: Tensor, motion: "_Motion", dt: Step) -> Gaussian:

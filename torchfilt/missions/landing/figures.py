@@ -20,9 +20,9 @@ def landing_figures(results: dict[str, Arrays], scene: Scene, folder: Path) -> l
 
 
 def _since_sight(values: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds since the first sight, and values (t, R) by that clock; NaN where a run has ended."""
-    before, after = round(_BEFORE_S / scene.dt), round(_AFTER_S / scene.dt)
-    clock = np.arange(-before, after)
+    """Seconds since the first sight while a run is under way, and values (t, R) by that clock, NaN where one is not."""
+    first, last = int(scene.acquired.max()), len(values) - int(scene.acquired.min())
+    clock = np.arange(max(-round(_BEFORE_S / scene.dt), -first), min(round(_AFTER_S / scene.dt), last))
     shifted = np.full((len(clock), values.shape[1]), np.nan)
     for run, first in enumerate(scene.acquired.tolist()):
         at = clock + first
@@ -52,7 +52,8 @@ def _errors(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
             axis.set(title=title, yscale="log")
         away = np.linalg.norm(result["error"][..., 6:9], axis=-1)
         seconds, shifted = _since_sight(np.where(np.isfinite(away), away, np.inf), scene)
-        axes.flat[3].plot(seconds, np.mean(shifted < 1.0, 1), color=f"C{k}")
+        near = np.where(np.isnan(shifted), np.nan, shifted < 1.0)
+        axes.flat[3].plot(seconds, np.nanmean(near, 1), color=f"C{k}")
     axes.flat[3].set(title="share of the runs within 1 m")
     for axis in axes[1]:
         axis.set_xlabel("s since the beacon was first seen")
@@ -74,7 +75,7 @@ def _particles(scene: Scene, path: Path) -> Path:
     }
     figure, axes = _new(1, len(trackers), (11, 5.5))
     truth = scene.model.representative(scene.truth[:, 0])[..., 7:9].numpy()
-    first = int(scene.acquired[0])
+    first = max(int(scene.acquired[0]), 1)
     last = min(first + round(3 / scene.dt), len(truth))
     for axis, (name, tracker) in zip(axes[0], trackers.items(), strict=True):
         history = tracker(

@@ -41,7 +41,7 @@ class GyroTransition(nn.Module):
 
     Raises:
         ValueError: a density that is negative or not one finite number, a time that is not positive; when called, no
-            control or time step, a control or state of another size, a negative step.
+            control or time step, a control or state of another size, a number below zero as a step.
     """
 
     densities: Tensor
