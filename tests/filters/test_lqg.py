@@ -1,5 +1,8 @@
 """The controller that acts on an estimate: the notes' numbers, separation, the price of a stationary loop."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -287,3 +290,13 @@ def test_it_is_a_module():
 def test_errors(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def test_the_pages_examples_run():
+    """docs/linear_systems.md, one block after the other, each with its own assertions."""
+    text = (Path(__file__).parents[2] / "docs/linear_systems.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    assert len(blocks) == 5 and all("assert" in block for block in blocks)
+    names = {}
+    for block in blocks:
+        exec(compile(block, "docs/linear_systems.md", "exec"), names)
