@@ -157,6 +157,23 @@ def test_noise_of_the_height_reaches_the_lag():
     np.testing.assert_allclose(drifting(normal(2, 3), None, 0.3).covariance[0, 2], [0, 0, 0.012], atol=1e-15)
 
 
+def test_constants_follow():
+    """The law without them, with numbers behind it that neither move nor are moved."""
+    for lag, walk in ((TAU, 0.05), (None, 0.05), (TAU, None)):
+        plain, law = (WithAltimeter(LANDING, lag, walk, constants=count) for count in (0, 3))
+        x = states(3, law.space.size)
+        own = plain.space.size
+        (mean, slope), (expected, part) = ((a.first_order(b, CONTROL, 0.3)) for a, b in ((law, x), (plain, x[:, :own])))
+        torch.testing.assert_close(mean.mean, torch.cat([expected.mean, x[:, own:]], -1), rtol=0, atol=0)
+        torch.testing.assert_close(
+            slope, torch.stack([torch.block_diag(row, torch.eye(3, dtype=DOUBLE)) for row in part])
+        )
+        wanted = nn.functional.pad(expected.covariance, (0, 3, 0, 3))
+        torch.testing.assert_close(mean.covariance, wanted.expand_as(mean.covariance), rtol=0, atol=0)
+        assert law.noise_in == plain.noise_in
+        check_law(law, x, CONTROL, 0.3)
+
+
 def test_walk_trains():
     walk = nn.Parameter(torch.tensor(0.05, dtype=DOUBLE))
     WithAltimeter(LANDING, None, walk)(states(1, 17), CONTROL, 4.0).scale_tril[..., -1].sum().backward()
@@ -168,6 +185,8 @@ def test_transition_refuses():
         WithAltimeter(LANDING)
     with pytest.raises(ValueError, match="time_constant_s must be positive and finite, got 0"):
         WithAltimeter(LANDING, 0.0)
+    with pytest.raises(ValueError, match="constants must not be negative, got -1"):
+        WithAltimeter(LANDING, TAU, constants=-1)
     for walk in (-1.0, math.nan, torch.ones(2)):
         with pytest.raises(ValueError, match="offset_walk must be one finite number >= 0"):
             WithAltimeter(LANDING, TAU, walk)

@@ -72,7 +72,7 @@ class WithAltimeter(nn.Module):
     """A transition with the altimeter's own numbers appended to its state: lagged height, then offset.
 
     The lagged height follows the height exactly as long as that is linear in time over a step; what noise the step puts
-    on the height it takes over by its share. The offset is a random walk.
+    on the height it takes over by its share. The offset is a random walk. Constants may follow.
 
     Args:
         law: transition of the first d numbers, with a ``space`` that has a size and, for ``first_order`` to be offered,
@@ -81,11 +81,12 @@ class WithAltimeter(nn.Module):
         offset_walk: root of the spectral density of the offset's rate, units of the offset (Pa or m) per sqrt(s), a
             number or scalar tensor (a parameter trains); None leaves the offset out.
         height: index of the height in the state.
+        constants: how many numbers that stay as they are follow, such as a magnetometer's hard iron.
 
     Raises:
         ValueError: neither lag nor offset, a time constant that is not positive, a walk that is negative or not finite,
-            a height outside the state, a law without a space of known size; when called, no dt, a state of another
-            size.
+            a height outside the state, a negative number of constants, a law without a space of known size; when
+            called, no dt, a state of another size.
     """
 
     walk: Tensor
@@ -97,6 +98,7 @@ class WithAltimeter(nn.Module):
         offset_walk: Tensor | float | None = None,
         *,
         height: int = 9,
+        constants: int = 0,
     ) -> None:
         super().__init__()
         inner = getattr(law, "space", None)
@@ -104,6 +106,8 @@ class WithAltimeter(nn.Module):
             raise ValueError(f"law must state a space of known size, {type(law).__name__} has {inner!r}")
         if time_constant_s is None and offset_walk is None:
             raise ValueError("give time_constant_s=, offset_walk= or both: there is nothing to append")
+        if constants < 0:
+            raise ValueError(f"constants must not be negative, got {constants}")
         if time_constant_s is not None:
             lag_weights(0.0, time_constant_s)
         curved = inner.size - inner.tangent_size
@@ -112,7 +116,12 @@ class WithAltimeter(nn.Module):
         hold(self, "walk", _walk(offset_walk))
         self.law: Any = law
         self.height, self.time_constant_s = height, time_constant_s
-        self.extra = (time_constant_s is not None) + (offset_walk is not None)
+        self.lags, self.drifts, self.constants = (
+            int(time_constant_s is not None),
+            int(offset_walk is not None),
+            constants,
+        )
+        self.extra = self.lags + self.drifts + constants
         self.space = _appended(inner, self.extra)
         self._size, self._error = inner.size, inner.tangent_size
         self._row = height - curved
@@ -120,18 +129,18 @@ class WithAltimeter(nn.Module):
         reached = None if isinstance(reached, slice) else reached
         self._noisy_height = reached is None or self._row in reached
         if reached is not None:
-            lag = [self._error] if time_constant_s is not None and self._noisy_height else []
-            self.noise_in = [*reached, *lag, *([self._error + self.extra - 1] if offset_walk is not None else [])]
+            lag = [self._error] if self.lags and self._noisy_height else []
+            self.noise_in = [*reached, *lag, *([self._error + self.lags] if self.drifts else [])]
         if hasattr(law, "first_order"):
             self.first_order = self._first_order
 
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Step = None) -> Gaussian:
-        """Law of the longer state (..., d + 1 or d + 2) after a step of dt (number or (..., 1)), s."""
+        """Law of the longer state (..., d + extra) after a step of dt (number or (..., 1)), s."""
         step = self._check(x, dt)
         return self._extend(x, self.law(x[..., : self._size], u, dt), step)
 
     def _first_order(self, x: Tensor, u: Tensor | None = None, dt: Step = None) -> tuple[Gaussian, Tensor]:
-        """The law at x and the derivative (..., e + 1 or 2, same) of its mean's error by the error of x."""
+        """The law at x and the derivative (..., e + extra, e + extra) of its mean's error by the error of x."""
         step = self._check(x, dt)
         inner, slope = self.law.first_order(x[..., : self._size], u, dt)
         eye = torch.eye(self._error + self.extra, dtype=x.dtype, device=x.device)
@@ -141,8 +150,7 @@ class WithAltimeter(nn.Module):
             height, lagged = eye[self._row : self._row + 1], eye[self._error : self._error + 1]
             after = rows[0][..., self._row : self._row + 1, :]
             rows.append(weights.lagged * lagged + weights.before * height + weights.after * after)
-        if self.extra > len(rows) - 1:
-            rows.append(eye[-1:])
+        rows.append(eye[self._error + self.lags :])
         lead = torch.broadcast_shapes(x.shape[:-1], *(row.shape[:-2] for row in rows))
         jacobian = torch.cat([row.expand(*lead, *row.shape[-2:]) for row in rows], -2)
         return self._extend(x, inner, step), jacobian
@@ -156,13 +164,14 @@ class WithAltimeter(nn.Module):
             lagged = weights.lagged * x[..., self._size : self._size + 1] + weights.before * x[..., at]
             parts.append(lagged + share * inner.mean[..., at])
             factors.append(x.new_zeros(1))
-        if self.extra > len(factors):
-            parts.append(x[..., -1:])
+        parts.append(x[..., self._size + self.lags :])
+        if self.drifts:
             drift = self.walk.to(x.dtype) * dt**0.5
             factors.append(drift if drift.dim() else drift.unsqueeze(0))
+        factors.append(x.new_zeros(self.constants))
         own = _beside(factors)
         mean = _beside(parts)
-        if inner.is_diagonal and not (self.time_constant_s is not None and self._noisy_height):
+        if inner.is_diagonal and not (self.lags and self._noisy_height):
             return Gaussian(mean, _beside([inner.scale_tril, own]), self.space, True)
         factor = inner.factor()
         taken = pad(factor[..., self._row : self._row + 1, :] * _wide(share), (0, 0, 0, self.extra - 1))
