@@ -7,7 +7,7 @@ is an argument, so that laws combine freely.
 
 from torchfilt.lazy import lazy_names
 
-_HOMES = dict.fromkeys(["atmosphere", "barometer", "imu", "magnetometer", "ultrasonic"], "")
+_HOMES = dict.fromkeys(["atmosphere", "barometer", "imu", "magnetometer", "ranges", "ultrasonic"], "")
 
 __all__ = sorted(_HOMES)
 
