@@ -154,7 +154,8 @@ class VerticalMotion(nn.Module):
 
     A state is height m, velocity up m/s, bias of the upward force m/s^2, slow offset and wander of a barometer m. The
     control u (..., 2) is the measured increment of velocity in m/s and the deviation of its error. The force is taken
-    as constant over the step; bias and offset are random walks, the wander is a first-order Gauss-Markov process.
+    as constant over the step; bias and offset are random walks, the wander is a first-order Gauss-Markov process. What
+    drives the bias reaches the velocity from the next step on.
 
     Args:
         bias_walk_m_s3_sqrt_hz, offset_walk_m_sqrt_s: roots of the spectral densities that drive them, zero or more.
@@ -164,7 +165,7 @@ class VerticalMotion(nn.Module):
         ValueError: a negative number, a time that is not positive; when called, no control or no step.
 
     Source: white noise through two integrators, Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
-        and Navigation (2001), equation 6.2.2-12.
+        and Navigation (2001), section 6.2.2.
     """
 
     def __init__(
