@@ -13,6 +13,7 @@ import torchfilt as tf
 from torchfilt.filters.observer import LuenbergerObserver, SteadyStateKalmanFilter
 from torchfilt.models.control import c2d, place, ss
 from torchfilt.models.control.continuous import linear_model
+from torchfilt.models.relative_motion import ClohessyWiltshire
 from torchfilt.testing import check_filter
 
 DOUBLE = torch.float64
@@ -330,6 +331,35 @@ def test_dt_zero_and_predict_first_mean_no_motion():
     # The claimed prior is the stationary posterior: its innovation is what its factor says, not that of a prediction.
     expected = (0.18029583226 + 0.5) ** 0.5
     assert info.innovation_scale_tril.item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_laws_of_the_library_with_controls_of_their_own():
+    """Clohessy-Wiltshire motion takes a thrust; a step without measurement is the recursive filter's mean."""
+    law = ClohessyWiltshire(1.1e-3, 1e-4, 10.0)
+    sight = tf.LinearGaussian(torch.eye(3, 6, dtype=DOUBLE), torch.eye(3, dtype=DOUBLE))
+    prior = tf.Gaussian(100 * normal(6), torch.eye(6, dtype=DOUBLE))
+    model = tf.StateSpaceModel(prior, law, sight)
+    filter, thrust = SteadyStateKalmanFilter(model, 10.0), normal(3, seed=1)
+    nothing = torch.full((3,), torch.nan, dtype=DOUBLE)
+    found = filter.step(filter.init(), nothing, thrust)[0].belief.mean
+    recursive = tf.KalmanFilter(model)
+    expected = recursive.step(recursive.init(), nothing, thrust, 10.0)[0].belief.mean
+    torch.testing.assert_close(found, expected, rtol=1e-13, atol=1e-13)
+    assert not torch.allclose(found, filter.step(filter.init(), nothing)[0].belief.mean)
+
+
+def test_offsets_and_controls_of_both_laws():
+    """Constant offsets and inputs to motion and measurement, against the recursive filter."""
+    offset = double([0.3, -0.2])
+    motion = tf.LinearGaussian(TWO.a, TWO_NOISE[0], offset, control_matrix=TWO.b)
+    sight = tf.LinearGaussian(TWO.c, TWO_NOISE[1], 2 * offset, control_matrix=TWO.d)
+    model = tf.StateSpaceModel(PRIOR, motion, sight)
+    ys, us = normal(100, 3, 2), normal(100, 3, 1, seed=1)
+    constant, recursive = SteadyStateKalmanFilter(model)(ys, us), tf.KalmanFilter(model)(ys, us)
+    torch.testing.assert_close(constant.mean[60:], recursive.mean[60:], rtol=1e-10, atol=1e-11)
+    assert constant.evidence == "approximate" and recursive.evidence == "exact"
+    with pytest.raises(ValueError, match="the transition has an input matrix but no control u"):
+        SteadyStateKalmanFilter(model)(ys)
 
 
 def test_laws_on_a_space():

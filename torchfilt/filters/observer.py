@@ -249,8 +249,8 @@ class SteadyStateKalmanFilter(Filter[Gaussian]):
             raise ValueError(f"dt must be positive and finite, got {dt}")
         self.dt, self.settled = dt, settled
         self.evidence = "approximate"  # stationary from the start is a claim, and a constant gain is the best only then
-        a, _, process_root = _constants(model.transition, dt)
-        c, _, measurement_root = _constants(model.observation, dt)
+        a, process_root = _constants(model.transition, dt)
+        c, measurement_root = _constants(model.observation, dt)
         if a.dim() != 2 or c.dim() != 2 or process_root.dim() != 2 or measurement_root.dim() != 2:
             raise ValueError(f"a stationary gain needs one system for all rows, got a matrix {tuple(a.shape)}")
         system = ss(a, a.new_zeros(len(a), 0), c, dt=1.0)
@@ -269,6 +269,10 @@ class SteadyStateKalmanFilter(Filter[Gaussian]):
         }
         for name, value in values.items():
             self.register_buffer(name, value.detach().clone())
+        for name in ("transition", "observation"):
+            rest, push = _response(getattr(model, name), dt)
+            self.register_buffer(f"{name}_rest", rest)
+            self.register_buffer(f"{name}_push", push)
 
     def init(self, batch_shape: tuple[int, ...] = (), seed: int = 0) -> FilterState[Gaussian]:
         """The prior's mean with the stationary covariance, or with its own (``settled=False``)."""
@@ -292,9 +296,8 @@ class SteadyStateKalmanFilter(Filter[Gaussian]):
         moves = predict and _moves(dt, self.dt)
         mean, root = belief.mean, belief.scale_tril
         if moves:
-            offset = _offset(self.model.transition, u, self.dt)
-            mean = belief.space.project(_plus(apply_factor(self.a, mean), offset))
-        expected = _plus(apply_factor(self.c, mean), _offset(self.model.observation, u, self.dt))
+            mean = belief.space.project(apply_factor(self.a, mean) + self._offset("transition", u))
+        expected = apply_factor(self.c, mean) + self._offset("observation", u)
         observed = _observed(y, missing)
         filled = y if observed is None else torch.where(observed, y, expected)
         innovation = _difference(law_space(self.model.observation).local(expected, filled), observed)
@@ -306,6 +309,20 @@ class SteadyStateKalmanFilter(Filter[Gaussian]):
         after = belief.space.retract(mean, apply_factor(gain, innovation))
         factor, info = _fixed_gain(root, gain, self.c, self.measurement_root, innovation, observed)
         return Gaussian(after, factor, belief.space), _status(info._replace(evidence=self.evidence), after, factor)
+
+    def _offset(self, name: str, u: Tensor | None) -> Tensor | float:
+        """What a law adds at the control u."""
+        push: Tensor | None = getattr(self, f"{name}_push")
+        if push is not None:
+            if u is None:
+                raise ValueError(f"the {name} has an input matrix but no control u was given")
+            rest: Tensor = getattr(self, f"{name}_rest")
+            return rest + u @ push.mT
+        offset = getattr(self.model, name).linear_form(u if self._hears(name) else None, self.dt).offset
+        return 0.0 if offset is None else offset
+
+    def _hears(self, name: str) -> bool:
+        return bool(getattr(getattr(self.model, name), "takes_controls", True))
 
     def _constant(self, belief: Gaussian, mean: Tensor, innovation: Tensor) -> tuple[Gaussian, StepInfo]:
         """Nothing but the mean moves."""
@@ -357,10 +374,6 @@ def _difference(innovation: Tensor, observed: Tensor | None) -> Tensor:
     return innovation if observed is None else torch.where(observed, innovation, 0)
 
 
-def _plus(mean: Tensor, offset: Tensor | None) -> Tensor:
-    return mean if offset is None else mean + offset
-
-
 def _moves(dt: Step, period: float | Tensor | None) -> bool:
     """Whether there is motion; a step other than the one that the gain belongs to is an error."""
     if dt is None:
@@ -374,28 +387,29 @@ def _moves(dt: Step, period: float | Tensor | None) -> bool:
     return True
 
 
-def _control_size(law: Any) -> int | None:
+def _constants(law: Any, dt: float | None) -> tuple[Tensor, Tensor]:
+    """Matrix and factor of a law's linear form at rest."""
+    matrix, _, factor = law.linear_form(_at_rest(law), dt)
+    return matrix, factor
+
+
+def _at_rest(law: Any) -> Tensor | None:
+    """A control of zeros where the law wants one, by its input matrix."""
     for name in ("control_matrix", "b"):
         matrix = getattr(law, name, None)
         if isinstance(matrix, Tensor):
-            return matrix.shape[-1]
+            return matrix.new_zeros(matrix.shape[-1])
     return None
 
 
-def _constants(law: Any, dt: float | None) -> tuple[Tensor, Tensor | None, Tensor]:
-    """Matrix, offset and factor of a law's linear form at rest."""
-    size = _control_size(law)
-    u = None
-    if size is not None:
-        like = next(tensor for tensor in (*law.buffers(), *law.parameters()))
-        u = like.new_zeros(size)
-    matrix, offset, factor = law.linear_form(u, dt)
-    return matrix, offset, factor
-
-
-def _offset(law: Any, u: Tensor | None, dt: float | None) -> Tensor | None:
-    offset: Tensor | None = law.linear_form(u if _control_size(law) is not None else None, dt).offset
-    return offset
+def _response(law: Any, dt: float | None) -> tuple[Tensor | None, Tensor | None]:
+    """Offset without control, and its derivative by the control (e, k); None where the law is to be asked each time."""
+    rest = _at_rest(law)
+    if rest is None:
+        return None, None
+    offset = law.linear_form(rest, dt).offset.detach()
+    each = law.linear_form(torch.eye(len(rest), dtype=rest.dtype, device=rest.device), dt).offset.detach()
+    return offset.clone(), (each - offset).mT.contiguous()
 
 
 def _check_measured(y: Tensor, c: Tensor) -> None:
