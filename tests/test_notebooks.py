@@ -1,10 +1,14 @@
-"""Notebooks and the README's examples run as they stand."""
+"""Notebooks and the examples of the README and of orientations run as they stand."""
 
 import re
 import runpy
 from pathlib import Path
 
 import pytest
+import torch
+
+import torchfilt as tf
+from torchfilt.testing import check_symmetry
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
@@ -28,3 +32,29 @@ def test_the_readmes_example_runs_and_prints_what_the_readme_says(capsys: pytest
     for name, value in claimed.items():
         # Two digits: the last bits of the training may differ between machines, the claim may not.
         assert float(errors[name]) == pytest.approx(float(value), rel=0.05)
+
+
+def test_the_examples_on_orientations_run_and_agree() -> None:
+    """One block after the other; every filter that they make goes on with the measurements of the first."""
+    text = (ROOT / "docs" / "attitude_filters.md").read_text()
+    names = {"tf": tf, "torch": torch}
+    for block in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
+        exec(compile(block, "docs/attitude_filters.md", "exec"), names)
+    rolling = tf.UnscentedKalmanFilter(
+        tf.StateSpaceModel(names["prior"], names["model"].transition, names["rolling"]), iterations=5
+    )
+    found = {}
+    for name, tracker in {key: names[key] for key in ("mekf", "bank", "imm", "gated", "safe")}.items():
+        state, info = tracker.step(tracker.init(), names["z"], names["rate"], 0.02)
+        assert info.ok, name
+        found[name] = state.belief.mean
+    state, _ = rolling.step(rolling.init(), {"accelerometer": names["up"]}, names["rate"], 0.02)
+    # The body is level with its nose north, and filters start there: they stay. Pieces of the bank start far off.
+    found["rolling"] = state.belief.mean
+    del found["bank"]
+    for name, mean in found.items():
+        torch.testing.assert_close(mean, names["mean"], rtol=0, atol=1e-3, msg=name)
+    tilt = tf.UnscentedKalmanFilter(names["tilt"])
+    assert tilt.step(tilt.init(), names["up"], names["rate"], 0.02)[1].ok
+    points = names["prior"].space.retract(names["mean"], 0.3 + 0.3 * torch.eye(6, dtype=torch.float64))
+    check_symmetry(names["tilt"], points, names["rate"], 0.02)

@@ -31,7 +31,8 @@ class Reacquire(Filter[Guarded]):
         filter: a `GaussianFilter`, or a `ParticleFilter` with the proposal `Local`, with a gate, on a model whose
             measurement law is `torchfilt.Sensors`.
         sensor: name of the sensor.
-        patience_s: time of refusals after which to start over.
+        patience_s: time of refusals after which to start over; one counts the length of its step, so that a sensor that
+            is slower than the filter needs patience_s / dt of them.
         rule: moment rule of the filter beside it; default the filter's own.
 
     Raises:
