@@ -141,6 +141,13 @@ def test_poles_that_cannot_be(wished, message):
         place(*INTEGRATORS, wished)
 
 
+def test_poles_that_rounding_alone_would_move_are_refused():
+    """Thirty states in a row behind one input, all to be made as fast as the first."""
+    a = torch.diag(torch.full((29,), 1.0, dtype=DOUBLE), -1) + normal(30, 30, seed=9) / 10
+    with pytest.raises(ValueError, match=r"are too sensitive to be placed in float64: they come out at .*, off by"):
+        place(a, torch.eye(30, 1, dtype=DOUBLE), -torch.linspace(1, 2, 30, dtype=DOUBLE))
+
+
 def test_the_row_of_the_batch_is_named():
     a = torch.stack([INTEGRATORS[0], torch.zeros(2, 2, dtype=DOUBLE)])
     with pytest.raises(ValueError, match=r"the mode 0 .*at row \(1,\) of the batch"):

@@ -17,6 +17,9 @@ from torchfilt.models.control.systems import StateSpace, as_system, check_matrix
 
 Array = NDArray[Any]
 
+_MISSED = 1e-3
+"""By how much of the largest pole those placed may be off."""
+
 
 class Regulator(NamedTuple):
     """gain K (*batch, k, d) of u = -K x. cost (*batch, d, d): S, so that x^T S x is the cost to go from x.
@@ -59,7 +62,8 @@ def place(a: Tensor, b: Tensor, poles: Any) -> Tensor:
     """Gain K with which A - B K has the poles that are wished for.
 
     An observer is the dual: ``place(a.mT, c.mT, poles).mT`` is the gain L of A - L C. Modes that the input cannot move
-    may be among the poles; they stay, and the others are placed.
+    may be among the poles; they stay, and the others are placed. With several inputs many gains will do; where SciPy
+    warns that its search has not converged, the poles are placed, but not by the least sensitive of them.
 
     Args:
         a: (*batch, d, d). b: (*batch, d, k). poles: d numbers, real or complex, or (*batch, d).
@@ -70,7 +74,8 @@ def place(a: Tensor, b: Tensor, poles: Any) -> Tensor:
     Raises:
         ValueError: another number of poles than states, a pole that is not finite, a complex pole without its
             conjugate, a pole wished for more often than B has independent columns (with one input: twice), a mode that
-            the input cannot move and that is not among the poles.
+            the input cannot move and that is not among the poles, poles so sensitive that rounding of the gain alone
+            moves them by a thousandth.
 
     Source: Tits and Yang, Globally convergent algorithms for robust pole assignment by state feedback, IEEE TAC 41
     (1996), as in ``scipy.signal.place_poles``; Popov, Belevitch and Hautus for the modes that stay.
@@ -113,7 +118,22 @@ def _place(a: Array, b: Array, wished: Array, eps: float) -> Array:
                 f"the pole {_number(pole)} is wished for {times} times, more often than B has independent columns, "
                 f"which is {rank}"
             )
-    return place_poles(part_a, part_b, wished, maxiter=300).gain_matrix @ basis.T
+    gain = place_poles(part_a, part_b, wished).gain_matrix @ basis.T
+    _check_placed(np.linalg.eigvals(a - b @ gain), np.concatenate([wished, fixed.values]))
+    return gain
+
+
+def _check_placed(reached: Array, wished: Array) -> None:
+    """With many states an input, poles may depend on the last digits of the gain; or an error."""
+    from scipy.optimize import linear_sum_assignment
+
+    distance = np.abs(reached[:, None] - wished)
+    worst = distance[linear_sum_assignment(distance)].max()
+    if worst > _MISSED * np.abs(wished).max():
+        raise ValueError(
+            f"the poles {_numbers(wished)} are too sensitive to be placed in float64: they come out at "
+            f"{_numbers(reached)}, off by {worst:.3g}; wish for others or place fewer with an input"
+        )
 
 
 def _paired(wished: Array) -> Array:
