@@ -57,13 +57,14 @@ def test_observers_of_the_notes(dtype):
     gain = place(system.a.mT, system.c.mT, [-2, -3]).mT
     assert gain.dtype == dtype
     np.testing.assert_allclose(gain, [[5], [6]], rtol=tolerance)
+    np.testing.assert_allclose(place(system.a.mT, system.c.mT, [-0.1, -0.3]).mT, [[0.4], [0.03]], rtol=tolerance)
     chain = tensor([[0.0, 1, 0], [0, 0, -1], [0, 0, 0]], dtype)
     gain = place(chain.mT, tensor([[1.0], [0], [0]], dtype), [-1, -1.5, -2]).mT
     np.testing.assert_allclose(gain, [[4.5], [6.5], [-3]], rtol=tolerance)
 
 
 @pytest.mark.parametrize("inputs", [1, 2, 4])
-@pytest.mark.parametrize("wished", [[-1, -2, -3, -4.5], [-1 + 2j, -1 - 2j, -3, -0.5]])
+@pytest.mark.parametrize("wished", [[-1, -2, -3, -4.5], [-1.1 + 2j, -1.1 - 2j, -3, -0.3]])
 def test_poles_are_placed_where_python_control_places_them(inputs, wished):
     """With one input the gain is unique."""
     a, b = normal(4, 4, seed=1), normal(4, inputs, seed=2)

@@ -58,6 +58,7 @@ def test_matrices_may_be_numbers_arrays_and_tensors():
     assert system.d.shape == (1, 1) and not system.d.any()
     assert system.dt == 0.5 and system.is_discrete and system.batch_shape == ()
     assert ss([[0, 1], [0, 0]], [[0], [1]]).a.dtype == DOUBLE
+    assert ss([[0.1]], [[1]]).a.item() == 0.1
 
 
 def test_without_c_the_state_comes_out():

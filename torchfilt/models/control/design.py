@@ -81,7 +81,8 @@ def place(a: Tensor, b: Tensor, poles: Any) -> Tensor:
     (1996), as in ``scipy.signal.place_poles``; Popov, Belevitch and Hautus for the modes that stay.
     """
     system = ss(a, b)
-    wished = torch.as_tensor(poles).to(torch.complex128)
+    wished = poles if isinstance(poles, Tensor) else torch.as_tensor(np.asarray(poles, dtype=complex))
+    wished = wished.to(torch.complex128)
     states, eps = system.a.shape[-1], torch.finfo(system.a.dtype).eps
     if wished.dim() == 0 or wished.shape[-1] != states:
         raise ValueError(f"poles must be {states} numbers, one a state, got shape {tuple(wished.shape)}")

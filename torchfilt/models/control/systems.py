@@ -368,7 +368,7 @@ def _column(dt: float | Tensor, like: Tensor) -> Tensor:
 def _as_matrix(value: Any, like: Tensor | None) -> Tensor:
     if isinstance(value, Tensor):
         return value
-    tensor = torch.as_tensor(value)
+    tensor = torch.as_tensor(np.asarray(value))  # by way of NumPy, whose numbers are double
     wanted = torch.float64 if like is None else like.dtype
     return tensor.to(dtype=wanted, device=None if like is None else like.device)
 
