@@ -440,6 +440,23 @@ def test_steps_compile_whole_and_map(name, missing):
         torch.testing.assert_close(other, right, rtol=1e-10, atol=1e-12, equal_nan=True)
 
 
+def test_single_precision_from_the_start():
+    """Designed in float64 whatever the system: the gain is the other's, rounded."""
+    small = linear_model(
+        ss(*(part.float() for part in (SAMPLED.system.a, SAMPLED.system.b, C)), dt=PERIOD),
+        SAMPLED.noise_covariance.float(),
+        R.float(),
+        tf.Gaussian(PRIOR.mean.float(), PRIOR.scale_tril.float()),
+    )
+    filter = SteadyStateKalmanFilter(small, PERIOD)
+    torch.testing.assert_close(filter.gain.double(), SteadyStateKalmanFilter(MODEL, PERIOD).gain, rtol=1e-5, atol=0)
+    assert filter(normal(4, 1).float(), normal(4, 1).float()).mean.dtype == torch.float32
+    period = torch.tensor(PERIOD, dtype=DOUBLE)
+    observer = LuenbergerObserver(ss(TWO.a, TWO.b, TWO.c, TWO.d, period), 0.5 * torch.eye(2, dtype=DOUBLE))
+    ys, us = normal(3, 2), normal(3, 1)
+    assert torch.equal(observer(ys, us).mean, observer(ys, us, PERIOD).mean)
+
+
 def test_a_history_survives_a_file(tmp_path):
     filter = SteadyStateKalmanFilter(MODEL, PERIOD)
     ys, us = normal(6, 1), normal(6, 1, seed=1)

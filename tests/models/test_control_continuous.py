@@ -135,6 +135,15 @@ def test_matrices_of_a_repeated_step_are_held_until_they_would_be_stale():
     assert law.matrices(0.5)[2].dtype == torch.float32
 
 
+def test_matrices_made_in_inference_mode_are_not_held():
+    law = ContinuousLinear(INTEGRATOR, double([[0.04]]), DOWN)
+    with torch.inference_mode():
+        law.matrices(0.5)
+    x = torch.ones(2, dtype=DOUBLE, requires_grad=True)
+    law(x, None, 0.5).mean.sum().backward()
+    assert x.grad.tolist() == [1.0, 1.5]
+
+
 def test_gradients_reach_the_density_and_the_dynamics():
     a, q = (0.3 * normal(2, 2, seed=9)).requires_grad_(), double([[0.5, 0.1], [0.1, 0.3]]).requires_grad_()
     g = normal(2, 2, seed=10).requires_grad_()

@@ -78,7 +78,7 @@ class LuenbergerObserver(Filter[Gaussian]):
         process = like.new_zeros(d, d) if process_noise is None else process_noise
         measured = like.new_zeros(m, m) if measurement_noise is None else measurement_noise
         super().__init__(linear_model(plant, process, measured, _prior(initial, like), noise_input))
-        self.claims, self.dt = claims, plant.dt
+        self.claims, self.dt = claims, None if plant.dt is None else float(plant.dt)
         for name in ("a", "b", "c", "d"):
             self.register_buffer(name, getattr(plant, name).clone())
         self.register_buffer("gain", gain.clone())
@@ -374,11 +374,11 @@ def _difference(innovation: Tensor, observed: Tensor | None) -> Tensor:
     return innovation if observed is None else torch.where(observed, innovation, 0)
 
 
-def _moves(dt: Step, period: float | Tensor | None) -> bool:
+def _moves(dt: Step, period: float | None) -> bool:
     """Whether there is motion; a step other than the one that the gain belongs to is an error."""
     if dt is None:
         return True
-    if isinstance(dt, Tensor) or isinstance(period, Tensor):
+    if isinstance(dt, Tensor):
         raise ValueError("the gain belongs to one time step: dt must be left out, or be this number or 0")
     if dt == 0:
         return False

@@ -112,7 +112,7 @@ def _may_hold(parts: list[Tensor]) -> bool:
     """Whether matrices made of these tensors can be kept beyond the call."""
     if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active() or is_differentiated(*parts):
         return False
-    return not any(part.is_inference() for part in parts)
+    return not torch.is_inference_mode_enabled() and not any(part.is_inference() for part in parts)
 
 
 class ContinuousLinear(nn.Module):
