@@ -292,6 +292,21 @@ def test_a_time_step_may_be_a_tensor_without_dims():
     torch.testing.assert_close(gradient, (above - below) / 2e-5, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_steps_of_a_tensor_have_the_bits_of_the_series(dtype):
+    """Noise that grows with the root of the step: rounded in the model's precision or in Python's, one way only."""
+    walk = tf.AdditiveGaussian(lambda x, dt: x * (1 + dt**0.5 / 3), 0.1 * torch.eye(1, dtype=dtype))
+    sensor = tf.LinearGaussian(torch.eye(1, dtype=dtype), torch.eye(1, dtype=dtype))
+    prior = tf.Gaussian(torch.ones(1, dtype=dtype), torch.eye(1, dtype=dtype))
+    tracker = tf.UnscentedKalmanFilter(tf.StateSpaceModel(prior, walk, sensor))
+    generator = torch.Generator().manual_seed(3)
+    dt, y = (torch.rand(40, *shape, generator=generator, dtype=dtype) for shape in ((), (1,)))
+    state = tracker.init()
+    for k in range(40):
+        state, _ = tracker.step(state, y[k], dt=dt[k])
+    assert torch.equal(state.belief.mean, tracker(y, dt=dt).mean[-1])
+
+
 def test_a_filter_needs_a_model():
     with pytest.raises(TypeError, match="model must be a StateSpaceModel, got Linear"):
         tf.GaussianFilter(torch.nn.Linear(1, 1), RULES["taylor"])

@@ -114,7 +114,8 @@ class Filter(nn.Module, Generic[B]):
             if dt.dim() and dt.shape != batch:
                 raise ValueError(f"dt must be a number or {tuple(batch)}, got {tuple(dt.shape)}")
             _check_step_dtype(dt, y)
-            dt = dt.unsqueeze(-1)
+            # A plain number where a series would have one: the bits of both are the same.
+            dt = dt.unsqueeze(-1) if dt.dim() or dt.requires_grad else dt.item()
         missing = _missing_of(y)
         noise = self.draw(state.belief, state.step, state.seed)
         belief, info = self.advance(state.belief, y, u, dt, noise, missing, predict_first)
