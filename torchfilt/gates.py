@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchfilt.moments import GateDecision, Linearization
-from torchfilt.spaces import Space
 
 
 @dataclass(frozen=True)
@@ -46,14 +45,11 @@ class Gate:
             if not -float("inf") < value < float("inf"):
                 raise ValueError(f"outlier_log_density must be finite, got {value}")
 
-    def __call__(
-        self, law: Any, space: Space, line: Linearization, innovation: Tensor, observed: Tensor | None
-    ) -> GateDecision:
+    def __call__(self, law: Any, line: Linearization, innovation: Tensor, observed: Tensor | None) -> GateDecision:
         """Decide about one measurement.
 
         Args:
             law: the measurement law; ``names`` and ``parts`` are looked for.
-            space: of the measurement.
             line: its linearisation.
             innovation: (..., e), zero where not observed.
             observed: (..., e), (e,) or None for all.

@@ -381,9 +381,7 @@ class GateDecision(NamedTuple):
 class GateRule(Protocol):
     """Decides about a measurement before it is taken in; `torchfilt.gates.Gate` is one."""
 
-    def __call__(
-        self, law: Any, space: Space, line: Linearization, innovation: Tensor, observed: Tensor | None
-    ) -> GateDecision: ...
+    def __call__(self, law: Any, line: Linearization, innovation: Tensor, observed: Tensor | None) -> GateDecision: ...
 
 
 def update(
@@ -418,7 +416,7 @@ def update(
         raise ValueError(f"the measurement has {y.shape[-1]} numbers, the observation law gives {line.mean.shape[-1]}")
     observed, decision = _observed(line.space, y, missing), None
     if gate is not None:
-        decision = gate(law, line.space, line, _innovation(line, y, observed), observed)
+        decision = gate(law, line, _innovation(line, y, observed), observed)
         observed = decision.kept
     result = _condition(prior, line, None, y, observed)
     for _ in range(iterations - 1):

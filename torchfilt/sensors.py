@@ -14,7 +14,6 @@ from torchfilt.spaces import EUCLIDEAN, Euclidean, Product, Space
 
 Law = Callable[..., Any]
 Step = Tensor | float | None
-_SHORT_CUTS = ("linear_form", "first_order", "linear_in")
 
 
 class PseudoMeasurement(nn.Module):
