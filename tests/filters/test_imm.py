@@ -488,3 +488,13 @@ def test_errors_of_types_and_steps():
     with pytest.raises(ValueError, match="needs a factor for its components"):
         state = filter.init((3,))
         filter.step(state._replace(belief=state.belief._replace(scale_tril=None)), torch.zeros(3, 2, dtype=DOUBLE))
+
+
+def test_a_single_model_is_told_so():
+    model = tf.StateSpaceModel(
+        tf.Gaussian(torch.zeros(1), torch.eye(1)),
+        tf.LinearGaussian(torch.eye(1), torch.eye(1)),
+        tf.LinearGaussian(torch.eye(1), torch.eye(1)),
+    )
+    with pytest.raises(TypeError, match="models must be a sequence of models, got a single one"):
+        tf.InteractingMultipleModel(model, torch.eye(1))

@@ -46,7 +46,7 @@ def test_settings_are_checked(change, rule):
 
 
 def test_a_stop_before_the_first_step_is_refused(log):
-    with pytest.raises(ValueError, match="there is no room for a step of 10 rows"):
+    with pytest.raises(ValueError, match=r"a step of 10 rows from 4\.80 s, when .* to 4\.00 s"):
         make_motion(log, ImuMagSettings(stop_s=4.0))
 
 

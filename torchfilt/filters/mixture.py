@@ -150,6 +150,8 @@ class InteractingMultipleModel(Filter[Particles]):
         rates_per_s: Tensor | None = None,
         gate: Gate | None = None,
     ) -> None:
+        if isinstance(models, StateSpaceModel):
+            raise TypeError("models must be a sequence of models, got a single one")
         models = list(models)
         if not models:
             raise ValueError("models must hold one model or more, got none")

@@ -138,7 +138,10 @@ def make_motion(log: ImuMagLog, settings: ImuMagSettings) -> Motion:
     last = int(moved[-1]) if settings.stop_s is None else min(int(settings.stop_s / row_s), len(seen) - 1)
     steps = (last - first) // settings.group
     if steps < 1:
-        raise ValueError(f"there is no room for a step of {settings.group} rows between rows {first} and {last}")
+        raise ValueError(
+            f"there is no room for a step of {settings.group} rows from {first * row_s:.2f} s, when the cameras first "
+            f"see the sensor, to {last * row_s:.2f} s"
+        )
     rows = slice(first + 1, first + 1 + steps * settings.group)
     delay = field_delay(log)
     held = torch.cat([log.mag_t[delay:], log.mag_t[-1:].expand(delay, 3)])
