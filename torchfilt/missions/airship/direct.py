@@ -30,7 +30,8 @@ class DirectTransition(nn.Module):
 
     Rate and acceleration are first-order Gauss-Markov processes, constant over a step: the new ones turn the attitude,
     change the velocity and move the position. Their driving noise is the same in all directions, so that that of the
-    rate may be drawn in world axes, where the factor is triangular. Biases are random walks.
+    rate may be drawn in world axes, where the factor is triangular; it reaches the attitude to first order in the turn
+    of a step. Biases are random walks.
 
     Args:
         step_s: length of a step. rate_sd_rad_s, rate_time_s, acceleration_sd_m_s2, acceleration_time_s: standard
@@ -39,7 +40,7 @@ class DirectTransition(nn.Module):
 
     Raises:
         ValueError: a number that is negative or not finite, a step or time that is zero; when called, a time step other
-            than step_s.
+            than step_s, one a row, a state of another size.
 
     Source: Maybeck, Stochastic Models, Estimation, and Control 1 (1979), section 6.3: direct and indirect filters;
         Singer, IEEE TAES 6 (1970), for the processes.
@@ -59,11 +60,16 @@ class DirectTransition(nn.Module):
         accel_bias_walk_m_s2_sqrt_s: float = 0.0,
     ) -> None:
         super().__init__()
-        given = {name: value for name, value in locals().items() if name.endswith(("_s", "_s2"))}
-        for name, value in given.items():
-            lasting = name in ("step_s", "rate_time_s", "acceleration_time_s")
-            if not 0 <= value < math.inf or (lasting and value == 0):
-                raise ValueError(f"{name} must be finite and {'positive' if lasting else 'not negative'}, got {value}")
+        _check_positive(step_s=step_s, rate_time_s=rate_time_s, acceleration_time_s=acceleration_time_s)
+        sizes = {
+            "rate_sd_rad_s": rate_sd_rad_s,
+            "acceleration_sd_m_s2": acceleration_sd_m_s2,
+            "gyro_bias_walk_rad_s_sqrt_s": gyro_bias_walk_rad_s_sqrt_s,
+            "accel_bias_walk_m_s2_sqrt_s": accel_bias_walk_m_s2_sqrt_s,
+        }
+        for name, value in sizes.items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be finite and not negative, got {value}")
         self.step_s, self.space = step_s, DIRECT_SPACE
         self.decays = tuple(math.exp(-step_s / time_s) for time_s in (rate_time_s, acceleration_time_s))
         rate, push = (
@@ -93,7 +99,11 @@ class DirectTransition(nn.Module):
         return self._law(x, mean), jacobian
 
     def _move(self, x: Tensor, dt: Step) -> Tensor:
-        if dt is not None and not isinstance(dt, Tensor) and abs(dt - self.step_s) > 1e-9 * self.step_s:
+        if x.shape[-1] != self.space.size:
+            raise ValueError(f"the state must be (..., {self.space.size}), got {tuple(x.shape)}")
+        if isinstance(dt, Tensor):
+            raise ValueError(f"dt must be one number, the step the law was made for, {self.step_s}, got a tensor")
+        if dt is not None and not abs(dt - self.step_s) <= 1e-9 * self.step_s:
             raise ValueError(f"dt must be the step the law was made for, {self.step_s}, got {dt}")
         h = self.step_s
         rate, push = self.decays[0] * x[..., _RATE], self.decays[1] * x[..., _ACCELERATION]
@@ -132,7 +142,7 @@ class InertialMeasurement(nn.Module):
         step_s: length of the step. angle_random_walk_rad_sqrt_s, velocity_random_walk_m_s_sqrt_s: as in `ImuGrade`.
 
     Raises:
-        ValueError: a number that is not positive and finite.
+        ValueError: a number that is not positive and finite; when called, a state without rate and acceleration.
     """
 
     deviation: Tensor
@@ -142,16 +152,19 @@ class InertialMeasurement(nn.Module):
         self, step_s: float, angle_random_walk_rad_sqrt_s: float, velocity_random_walk_m_s_sqrt_s: float
     ) -> None:
         super().__init__()
-        given = {name: value for name, value in locals().items() if name.endswith("_s")}
-        for name, value in given.items():
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {value}")
+        _check_positive(
+            step_s=step_s,
+            angle_random_walk_rad_sqrt_s=angle_random_walk_rad_sqrt_s,
+            velocity_random_walk_m_s_sqrt_s=velocity_random_walk_m_s_sqrt_s,
+        )
         self.step_s = step_s
         sizes = [angle_random_walk_rad_sqrt_s] * 3 + [velocity_random_walk_m_s_sqrt_s] * 3
         hold(self, "deviation", torch.tensor(sizes, dtype=torch.float64) / step_s**0.5)
 
     def forward(self, x: Tensor) -> Gaussian:
         """Law of rate, rad/s, and specific force, m/s^2, both in body axes, at states (..., 22 or more)."""
+        if x.shape[-1] < DIRECT_SPACE.size:
+            raise ValueError(f"the state must have {DIRECT_SPACE.size} numbers or more, got {tuple(x.shape)}")
         middle = multiply(x[..., :4], from_rotation_vector(-self.step_s / 2 * x[..., _RATE]))
         force = rotate(inverse(middle), x[..., _ACCELERATION] + x.new_tensor([0, 0, GRAVITY_M_S2]))
         mean = torch.cat([x[..., _RATE] + x[..., 10:13], force + x[..., 13:16]], -1)
@@ -165,3 +178,9 @@ def to_rates(controls: Tensor, dt: float) -> Tensor:
     """
     dtheta, dv = controls.split(3, -1)
     return torch.cat([dtheta, rotate(from_rotation_vector(-dtheta / 2), dv)], -1) / dt
+
+
+def _check_positive(**given: float) -> None:
+    for name, value in given.items():
+        if not 0 < value < math.inf:
+            raise ValueError(f"{name} must be finite and positive, got {value}")

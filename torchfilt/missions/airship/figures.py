@@ -1,0 +1,146 @@
+"""Figures of the airship study: the path of a mission, errors with what is claimed, and the time line of the modes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchfilt.missions.airship.navigation import MODES
+from torchfilt.missions.airship.scene import BEACONS_M, HALL_M, LANDING_M, MAST_M, WAYPOINTS_M, Scene
+from torchfilt.missions.stages import Arrays
+
+_COLOURS = ("C2", "C0", "C1")
+
+
+def airship_figures(results: dict[str, Arrays], scene: Scene, folder: Path) -> list[Path]:
+    """Draw them; returns the files. The first filter is the one that is shown alone, of the first run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    first = next(iter(results.values()))
+    drawn = [_mission(first, scene, folder / "mission.png"), _errors(first, scene, folder / "errors.png")]
+    drawn.append(_modes(first, scene, folder / "modes.png"))
+    if len(results) > 1:
+        drawn.append(_compare(results, scene, folder / "compare.png"))
+    return drawn
+
+
+def _new(rows: int, columns: int, size: tuple[float, float], **more: Any) -> tuple[Any, Any]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **more)
+
+
+def _mission(result: Arrays, scene: Scene, path: Path) -> Path:
+    """Truth and estimate from above, and the height along time, coloured by mode."""
+    figure, axes = _new(2, 1, (10, 8), height_ratios=(1.6, 1))
+    above, side = axes[:, 0]
+    truth, time = scene.truth[:, 0, 7:10].numpy(), scene.time.numpy()
+    estimate = truth - result["error"][:, 0, 6:9]
+    above.plot(*truth[:, :2].T, color="0.7", linewidth=4, label="truth")
+    side.plot(time, truth[:, 2], color="0.7", linewidth=4)
+    for k, mode in enumerate(MODES):
+        within = np.where((result["mode"][:, 0] == k)[:, None], estimate, np.nan)
+        above.plot(*within[:, :2].T, color=_COLOURS[k], linewidth=1.2, label=mode)
+        side.plot(time, within[:, 2], color=_COLOURS[k], linewidth=1.2)
+    above.plot(*np.array(BEACONS_M)[:, :2].T, "k^", label="beacons")
+    above.plot(*np.array(WAYPOINTS_M)[:, :2].T, "x", color="0.4", label="waypoints")
+    above.plot(*MAST_M[:2], "ks", label="mast")
+    above.plot(*LANDING_M, "k*", markersize=12, label="landing spot")
+    above.set(xlim=(0, HALL_M[0]), ylim=(0, HALL_M[1]), aspect="equal", xlabel="east, m", ylabel="north, m")
+    above.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=8)
+    side.set(xlabel="time, s", ylabel="height of the gondola, m")
+    figure.suptitle("A mission: from the mast along waypoints to the landing spot")
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def _errors(result: Arrays, scene: Scene, path: Path) -> Path:
+    """Errors of one run with three claimed deviations to either side."""
+    parts = [
+        ("tilt about east, deg", 0, 57.296),
+        ("tilt about north, deg", 1, 57.296),
+        ("heading, deg", 2, 57.296),
+        ("velocity east, m/s", 3, 1.0),
+        ("velocity north, m/s", 4, 1.0),
+        ("velocity up, m/s", 5, 1.0),
+        ("east, m", 6, 1.0),
+        ("north, m", 7, 1.0),
+        ("height, m", 8, 1.0),
+        ("gyro bias up, mrad/s", 11, 1e3),
+        ("accelerometer bias ahead, mm/s2", 13, 1e3),
+        ("accelerometer bias up, mm/s2", 14, 1e3),
+    ]
+    figure, axes = _new(4, 3, (13, 10), sharex=True)
+    time = scene.time.numpy()
+    for axis, (title, k, unit) in zip(axes.flat, parts, strict=True):
+        claim = 3 * unit * result["deviation"][:, 0, k]
+        axis.fill_between(time, -claim, claim, color="0.85", linewidth=0)
+        axis.plot(time, unit * result["error"][:, 0, k], color="C0", linewidth=0.7)
+        widest = np.quantile(claim, 0.9)
+        axis.set(title=title, ylim=(-1.5 * widest, 1.5 * widest))
+        _shade(axis, result["mode"][:, 0], time)
+    for axis in axes[-1]:
+        axis.set_xlabel("time, s")
+    figure.suptitle("Errors of one run, three claimed standard deviations grey; dotted lines: a new mode")
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def _shade(axis: Any, mode: np.ndarray, time: np.ndarray) -> None:
+    """Where the mode changes."""
+    for k in np.flatnonzero(np.diff(mode)):
+        axis.axvline(time[k + 1], color="0.3", linestyle=":", linewidth=0.8)
+
+
+def _modes(result: Arrays, scene: Scene, path: Path) -> Path:
+    """The modes of each run along time, and what the sonar and the claimed height say meanwhile."""
+    from matplotlib.colors import ListedColormap
+
+    figure, axes = _new(3, 1, (10, 7), sharex=True, height_ratios=(1.2, 1, 1))
+    lines, sonar, claim = axes[:, 0]
+    time = scene.time.numpy()
+    edges = np.append(0, time)
+    mode = np.maximum(result["mode"], -1).T
+    shown = ListedColormap(["0.8", *_COLOURS])
+    lines.pcolormesh(edges, np.arange(len(mode) + 1), mode, cmap=shown, vmin=-1.5, vmax=2.5)
+    lines.set(ylabel="run")
+    for k, name in enumerate(MODES):
+        lines.plot([], [], "s", color=_COLOURS[k], label=name)
+    lines.legend(loc="upper left", ncols=3, fontsize=8)
+    heard = scene.measurements["ultrasonic"][:, 0, 0].numpy()
+    sonar.plot(time, heard, ".", markersize=2, color="0.4")
+    sonar.plot(time, scene.truth[:, 0, 9], color="C3", linewidth=0.8)
+    sonar.set(ylabel="sonar (dots) and\nheight of run 0, m")
+    claim.semilogy(time, result["deviation"][:, 0, 8], label="height, m")
+    claim.semilogy(time, result["deviation"][:, 0, 2], label="heading, rad")
+    claim.set(ylabel="claimed deviation", xlabel="time, s")
+    claim.legend(fontsize=8)
+    figure.suptitle("Modes of navigation")
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def _compare(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
+    """Rms over the runs, along time, of all filters."""
+    figure, axes = _new(2, 2, (12, 7), sharex=True)
+    parts = (
+        ("heading, deg", slice(2, 3), 57.296),
+        ("velocity, m/s", slice(3, 6), 1.0),
+        ("horizontal, m", slice(6, 8), 1.0),
+        ("height, m", slice(8, 9), 1.0),
+    )
+    time = scene.time.numpy()
+    every = max(round(1 / scene.dt), 1)
+    count = len(time) // every * every
+    for axis, (title, at, unit) in zip(axes.flat, parts, strict=True):
+        for k, (name, result) in enumerate(results.items()):
+            square = (result["error"][:count, :, at] ** 2).sum(-1).mean(1)
+            smooth = unit * np.sqrt(square.reshape(-1, every).mean(1))
+            axis.semilogy(time[every - 1 : count : every], smooth, color=f"C{k}", linewidth=0.9, label=name)
+        axis.set(title=title)
+    for axis in axes[-1]:
+        axis.set_xlabel("time, s")
+    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
+    figure.suptitle("Rms error of all runs, a second at a time")
+    figure.savefig(path, dpi=120)
+    return path
