@@ -9,8 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import torchfilt as tf
-from torchfilt.models.control import c2d, ss
-from torchfilt.models.control.continuous import ContinuousLinear, ContinuousTransition, noise_factor
+from torchfilt.models.control import ContinuousLinear, ContinuousTransition, integrate_noise, noise_factor
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
 from torchfilt.testing import check_filter, check_law
 
@@ -71,19 +70,31 @@ def test_stiff_systems_do_not_overflow(rate):
     torch.testing.assert_close(factor.square(), double([[-math.expm1(-2 * rate) / (2 * rate)]]), rtol=1e-12, atol=0)
 
 
-def test_the_factor_and_van_loans_covariance_agree():
-    """Two ways: Gauss sums on factors here, the block exponential in `c2d`."""
-    a, q = normal(5, 3, 3, seed=1), torch.eye(3, dtype=DOUBLE)
-    for dt in (0.01, 3.0):
-        factor = ContinuousLinear(a, q).matrices(dt)[2]
-        expected = c2d(ss(a, q), dt, q).noise_covariance
-        scale = expected.abs().amax((-2, -1), keepdim=True)
+def test_the_factor_belongs_to_the_covariance():
+    """A batch whose rows are doubled differently often, one noise for all and one a row."""
+    a, dt = normal(5, 3, 3, seed=1), double([0.01, 3.0, 0.0, 0.5, 40.0])
+    a[4] -= 5 * torch.eye(3, dtype=DOUBLE)
+    for columns in (double([[0.0], [0.0], [1.0]]), normal(5, 3, 4, seed=2)):
+        factor, expected = noise_factor(a, columns, dt), integrate_noise(a, columns @ columns.mT, dt)
+        scale = expected.abs().amax((-2, -1), keepdim=True).clamp_min(1e-300)
         torch.testing.assert_close(factor @ factor.mT / scale, expected / scale, rtol=0, atol=1e-12)
+        alone = torch.stack([noise_factor(a[k], columns.expand(5, 3, -1)[k], float(dt[k])) for k in range(5)])
+        torch.testing.assert_close(factor @ factor.mT / scale, alone @ alone.mT / scale, rtol=0, atol=1e-12)
 
 
 def test_beyond_the_reach_is_nan_not_wrong():
-    factor = noise_factor(double([[[-2049.0]], [[-2047.0]]]), torch.ones(1, 1, dtype=DOUBLE), torch.ones(2).double())
-    assert torch.isnan(factor[0]).all() and torch.isfinite(factor[1]).all()
+    """2^64 in plain calls, 2^20 in a traced one; a row beyond it, or without a number for dt, spoils no other."""
+    one = torch.ones(1, 1, dtype=DOUBLE)
+    a = double([[[-1e20]], [[-1e19]], [[-1.0]], [[-1.0]]])
+    dt = double([1.0, 1.0, torch.nan, torch.inf])
+    for noise in (noise_factor(a, one, dt).square(), integrate_noise(a, one, dt)):
+        assert torch.isnan(noise[[0, 2, 3]]).all()
+        torch.testing.assert_close(noise[1], double([[0.5e-19]]), rtol=1e-12, atol=0)
+    rates = double([[[-1.1e6]], [[-1e6]]])
+    for integral in (noise_factor, integrate_noise):
+        traced = torch.func.vmap(lambda a, integral=integral: integral(a, one, 1.0))(rates)
+        assert torch.isnan(traced[0]).all()
+        torch.testing.assert_close(traced[1].square() if integral is noise_factor else traced[1], 0.5 / -rates[1])
 
 
 def test_short_steps_of_a_long_chain_keep_all_digits():

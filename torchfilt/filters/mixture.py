@@ -10,6 +10,7 @@ from torch.distributions import MixtureSameFamily
 from torchfilt.gates import Gate, by_sensor
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import hold
+from torchfilt.linalg import matrix_exp
 from torchfilt.mixture import InitialMixture, MixtureLaw, check_probabilities, factors_of, merge, reduce
 from torchfilt.model import StateSpaceModel, as_gaussian, check_batch
 from torchfilt.moments import Rule, Update, check_rule_type, unscented, update
@@ -255,7 +256,7 @@ class InteractingMultipleModel(Filter[Particles]):
         if self.rates_per_s is not None:
             if length is None:
                 raise ValueError("rates_per_s need the length of the step: give dt")
-            return torch.linalg.matrix_exp(self.rates_per_s * length)
+            return matrix_exp(self.rates_per_s * length)
         assert self.transition_probabilities is not None
         jump = self.transition_probabilities
         if isinstance(length, Tensor):

@@ -8,9 +8,9 @@ from torch import Tensor
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
 from torchfilt.laws import check_finite
 from torchfilt.linalg import apply_factor, log_abs_diagonal, psd_factor, triangularize, whiten
-from torchfilt.models.control.continuous import ContinuousLinear, linear_model, noise_factor
+from torchfilt.models.control.continuous import ContinuousLinear, linear_model
 from torchfilt.models.control.design import kalman
-from torchfilt.models.control.systems import StateSpace, as_system, hold_input, ss, state_noise
+from torchfilt.models.control.systems import StateSpace, as_system, hold_input, noise_factor, ss, state_noise
 from torchfilt.moments import law_space
 from torchfilt.run import Evidence, Filter, check_model
 from torchfilt.types import FilterState, Missing, Step, StepInfo, StepNoise

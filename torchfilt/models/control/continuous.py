@@ -7,7 +7,6 @@ construction; no difference of large numbers is ever factorised.
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,47 +14,14 @@ from torchfilt.gaussian import Gaussian
 from torchfilt.laws import LinearForm, LinearGaussian, call_style, check_finite, hold
 from torchfilt.linalg import apply_factor, for_points, is_differentiated, psd_factor, triangularize
 from torchfilt.model import StateSpaceModel
-from torchfilt.models.control.systems import as_system, hold_input, state_noise
+from torchfilt.models.control.systems import as_system, hold_input, noise_factor, state_noise
 from torchfilt.models.ode import rk4
 from torchfilt.spaces import EUCLIDEAN, Space, curved_components
 
 Step = Tensor | float | None
 Integrator = Callable[[Callable[[Tensor], Tensor], Tensor, Tensor | float], Tensor]
 
-# 8 Gauss nodes are exact to rounding up to |A| h = 2; ten doublings of h reach |A| dt = 2048.
-_NODES, _WEIGHTS = (values.tolist() for values in np.polynomial.legendre.leggauss(8))
-_DOUBLINGS, _REACH = 10, 2.0
 _HELD_STEPS = 8
-
-
-def noise_factor(a: Tensor, columns: Tensor, dt: Tensor) -> Tensor:
-    """Lower factor of the integral of exp(a s) L L^T exp(a s)^T over a step: the exact noise of a linear system.
-
-    A Gauss sum of outer products over dt / 2^10, doubled ten times: Q(2h) = Q(h) + Phi(h) Q(h) Phi(h)^T, on factors.
-    Stiff systems do not overflow, as they do in the block exponential, and short steps keep all digits.
-
-    Args:
-        a: (*batch, d, d).
-        columns: L (*batch, d, q), the noise input times a factor of its spectral density.
-        dt: (*batch), s.
-
-    Returns:
-        (*batch, d, d); NaN where the 1-norm of a times dt is above 2048.
-    """
-    nodes, weights = a.new_tensor(_NODES), a.new_tensor(_WEIGHTS)
-    short = (dt / 2**_DOUBLINGS).unsqueeze(-1)
-    at = torch.cat([short * (nodes + 1) / 2, short * a.new_tensor([2.0**k for k in range(_DOUBLINGS)])], -1)
-    # All at once: torch's exponential of a single matrix is wrong by 1e-12 where the norm is a few hundredths.
-    moved = torch.linalg.matrix_exp(a.unsqueeze(-3) * at[..., None, None])
-    responses = moved[..., : len(_NODES), :, :] @ columns.unsqueeze(-3)
-    sums = (responses * (short * weights / 2).sqrt()[..., None, None]).movedim(-3, -2).flatten(-2)
-    if sums.shape[-1] < a.shape[-1]:
-        sums = torch.nn.functional.pad(sums, (0, a.shape[-1] - sums.shape[-1]))
-    factor = triangularize(sums)
-    for k in range(len(_NODES), moved.shape[-3]):
-        factor = triangularize(torch.cat([moved[..., k, :, :] @ factor, factor], -1))
-    too_far = a.abs().sum(-2).amax(-1) * dt > _REACH * 2**_DOUBLINGS
-    return factor.masked_fill(too_far[..., None, None], torch.nan)
 
 
 class _Noise(nn.Module):
@@ -123,7 +89,8 @@ class ContinuousLinear(nn.Module):
     nor inside a compiled function.
 
     Args:
-        a: A (d, d) or (*batch, d, d), 1/s; up to a 1-norm of 2048 / dt, beyond which the noise is NaN.
+        a: A (d, d) or (*batch, d, d), 1/s; in a compiled function up to a 1-norm of 1e6 / dt, beyond which the noise is
+            NaN.
         noise_psd: Q (q, q) or (*batch, q, q), two-sided spectral density of the white noise.
         noise_input: G (*batch, d, q); None: the identity.
         b: B (*batch, d, k) or None.

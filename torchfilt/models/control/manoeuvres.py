@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchfilt.linalg import matrix_exp
 from torchfilt.models.control.observability import Pair, check_pair, obsv, scale_columns, zero_below
 from torchfilt.models.control.systems import as_system
 
@@ -59,7 +60,7 @@ def total_observability(pieces: Sequence[Any], durations_s: Sequence[float], *, 
     blocks = [obsv(*pairs[0], time_scale=time_scale)]
     past = torch.eye(pairs[0][0].shape[-1], dtype=pairs[0][0].dtype, device=pairs[0][0].device)
     for (before, _), (a, c), time in zip(pairs, pairs[1:], durations_s, strict=False):
-        past = torch.linalg.matrix_exp(before * time) @ past
+        past = matrix_exp(before * time) @ past
         blocks.append(obsv(a, c, time_scale=time_scale) @ past)
     return _stack(blocks)
 

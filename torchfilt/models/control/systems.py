@@ -7,13 +7,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torchfilt.linalg import psd_factor
+from torchfilt.linalg import matrix_exp, psd_factor, triangularize
 
 Array = NDArray[np.float64]
 
-_TRACED_DOUBLINGS = 20
-"""How often a traced `integrate_noise` may double its step: right up to ‖A‖ dt of a million."""
+# Eight Gauss nodes are exact to rounding where ‖A‖ h <= 1; doublings of h reach ‖A‖ dt = 2^64, in a traced function,
+# where all of them are unrolled, a million.
+_NODES, _WEIGHTS = (values.tolist() for values in np.polynomial.legendre.leggauss(8))
+_DOUBLINGS, _TRACED_DOUBLINGS = 64, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,46 +263,53 @@ def hold_input(a: Tensor, b: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor
     top = torch.cat(_together(a * period, b / size), -1)
     block = torch.cat([top, torch.zeros_like(top[..., :1, :]).expand(*top.shape[:-2], b.shape[-1], top.shape[-1])], -2)
     states = a.shape[-1]
-    whole = torch.linalg.matrix_exp(block)[..., :states, :]
+    whole = matrix_exp(block)[..., :states, :]
     return whole[..., :states], whole[..., states:] * (period * size)
 
 
 def integrate_noise(a: Tensor, noise_psd: Tensor, dt: float | Tensor) -> Tensor:
     """Covariance ∫ exp(A s) Q exp(A s)ᵀ ds over [0, dt], symmetric.
 
-    Van Loan's block holds exp(-A dt), which overflows for a fast stable mode. It is therefore taken over a part of the
-    period with ‖A‖ h <= 1 only, and the rest is reached by doubling: Q(2h) = Q(h) + Φ(h) Q(h) Φ(h)ᵀ, sums of
-    semidefinite matrices without cancellation.
+    A Gauss sum over a part h of dt with ‖A‖ h <= 1; the rest is reached by doubling: Q(2h) = Q(h) + Φ(h) Q(h) Φ(h)ᵀ.
+    Both are sums of semidefinite matrices without cancellation, so that stiff systems do not overflow, as they do in
+    the block exponential, and short steps keep all digits.
 
     Args:
-        a: (*batch, d, d). noise_psd: Q (*batch, d, d), symmetric positive semidefinite, not checked.
+        a: (*batch, d, d). noise_psd: Q (*batch, d, d), symmetric, not checked.
         dt: in s, a number or (*batch), 0 allowed. Under torch.compile and torch.func ‖A‖ dt may reach a million.
 
     Returns:
-        (*batch, d, d).
+        (*batch, d, d); NaN beyond the reach.
 
-    Source: Van Loan, IEEE TAC 23 (1978), eq. 1.3 with theorem 1.
+    Source: Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23 (1978), for the integrals.
     """
-    period = _column(dt, a)
-    length = (_size(a) * period).detach()
-    halvings = torch.log2(length).ceil().clamp_min(0)
-    step = period * torch.exp2(-halvings)
-    size = _size(noise_psd)
-    left, right = _together(-a * step, noise_psd / size)
-    left = torch.cat([left, torch.zeros_like(left)], -2)
-    right = torch.cat([right, (a * step).mT.expand_as(right)], -2)
-    whole = torch.linalg.matrix_exp(torch.cat([left, right], -1))
-    states = a.shape[-1]
-    transition = whole[..., states:, states:].mT
-    covariance = transition @ whole[..., :states, states:] * (step * size)
-    covariance = (covariance + covariance.mT) / 2
-    traced = torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
-    for k in range(_TRACED_DOUBLINGS if traced else int(halvings.max().item())):
-        on = k < halvings
-        further = transition @ covariance @ transition.mT
-        covariance = torch.where(on, covariance + (further + further.mT) / 2, covariance)
+    part = _short_step(a, dt)
+    covariance = _symmetric((part.weights * (part.responses @ noise_psd.unsqueeze(-3) @ part.responses.mT)).sum(-3))
+    transition = part.transition
+    for k in range(part.most):
+        on = k < part.doublings
+        covariance = torch.where(on, covariance + _symmetric(transition @ covariance @ transition.mT), covariance)
         transition = torch.where(on, transition @ transition, transition)
     return covariance
+
+
+def noise_factor(a: Tensor, columns: Tensor, dt: float | Tensor) -> Tensor:
+    """Lower factor of `integrate_noise` for Q = L Lᵀ, without forming a covariance; L (*batch, d, w) are the columns.
+
+    Arguments, reach and source as there. A covariance by construction, but with a root's gradient at dt = 0.
+
+    Returns:
+        (*batch, d, d); NaN beyond the reach.
+    """
+    part = _short_step(a, dt)
+    sums = (part.weights.sqrt() * (part.responses @ columns.unsqueeze(-3))).movedim(-3, -2).flatten(-2)
+    factor = triangularize(pad(sums, (0, max(a.shape[-1] - sums.shape[-1], 0))))
+    transition = part.transition
+    for k in range(part.most):
+        on = k < part.doublings
+        factor = torch.where(on, triangularize(torch.cat([transition @ factor, factor], -1)), factor)
+        transition = torch.where(on, transition @ transition, transition)
+    return factor
 
 
 def state_noise(a: Tensor, noise: Tensor, noise_input: Tensor | None, name: str) -> Tensor:
@@ -344,6 +354,36 @@ def _without_infinite_zeros(a: Array, b: Array, c: Array, d: Array, tolerance: f
         free = len(a) - bound
         c, d = np.vstack([c[:, :free], a[free:, :free]]), np.vstack([d, b[free:]])
         a, b = a[:free, :free], b[:free]
+
+
+class _ShortStep(NamedTuple):
+    """A part h of a step: exp(A s) at the nodes (*batch, 8, d, d), their weights (*batch, 8, 1, 1), and exp(A h).
+
+    doublings (*batch, 1, 1): how often h is to be doubled; most: in any row.
+    """
+
+    responses: Tensor
+    weights: Tensor
+    transition: Tensor
+    doublings: Tensor
+    most: int
+
+
+def _short_step(a: Tensor, dt: float | Tensor) -> _ShortStep:
+    period = _column(dt, a)
+    doublings = torch.log2((_size(a) * period).detach()).ceil().clamp_min(0)
+    traced = torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+    limit = _TRACED_DOUBLINGS if traced else _DOUBLINGS
+    most = limit if traced else int(doublings.nan_to_num(0).clamp_max(limit).max().item())
+    step = (period * torch.exp2(-doublings)).masked_fill(doublings > limit, torch.nan).unsqueeze(-3)
+    at = a.new_tensor([(node + 1) / 2 for node in _NODES] + [1.0])[:, None, None]
+    moved = matrix_exp(a.unsqueeze(-3) * (step * at))
+    weights = step * a.new_tensor([weight / 2 for weight in _WEIGHTS])[:, None, None]
+    return _ShortStep(moved[..., :-1, :, :], weights, moved[..., -1, :, :], doublings, most)
+
+
+def _symmetric(matrix: Tensor) -> Tensor:
+    return (matrix + matrix.mT) / 2
 
 
 def _size(matrix: Tensor) -> Tensor:
