@@ -17,6 +17,7 @@ NAMES = sorted(path.stem for path in SCRIPTS.glob("*.py") if not path.stem.start
 def test_there_is_a_script_for_each_part() -> None:
     assert NAMES == [
         "demo",
+        "run_airship",
         "run_attitude",
         "run_formation",
         "run_grace",

@@ -47,7 +47,7 @@ def _mission(result: Arrays, scene: Scene, path: Path) -> Path:
     above.plot(*MAST_M[:2], "ks", label="mast")
     above.plot(*LANDING_M, "k*", markersize=12, label="landing spot")
     above.set(xlim=(0, HALL_M[0]), ylim=(0, HALL_M[1]), aspect="equal", xlabel="east, m", ylabel="north, m")
-    above.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=8)
+    figure.legend(*above.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     side.set(xlabel="time, s", ylabel="height of the gondola, m")
     figure.suptitle("A mission: from the mast along waypoints to the landing spot")
     figure.savefig(path, dpi=120)

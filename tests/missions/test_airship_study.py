@@ -1,0 +1,157 @@
+"""The airship study: a short mission whole, its numbers, what is kept, what is refused; targets over many runs."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import run_airship
+import torch
+from scipy.stats import chi2
+
+from torchfilt.missions.airship import navigation, study
+from torchfilt.missions.airship.scene import AirshipSettings, make_scene
+
+SHORT = AirshipSettings(runs=2, anchored_s=12.0, cruise_s=14.0, approach_s=6.0)
+NAMES = ("indirect", "indirect-no-modes")
+
+
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("airship")
+    said = []
+    return folder, study.run_airship(SHORT, folder, NAMES, say=said.append), said
+
+
+def test_a_short_mission(outcome):
+    folder, summary, said = outcome
+    entry = summary["filters"]["indirect"]
+    assert entry["failed"] == 0 and entry["cruise"]["horizontal_m"] < 0.2 and entry["ms_per_step"] > 0
+    assert entry["switches"] == {
+        "released from the mast, heading known to 3 deg": 2,
+        "released from the mast before it was aligned": 0,
+        "low over the landing spot": 0,
+        "climbed away from the ground": 0,
+        "height lost: no echo for too long": 0,
+    }
+    assert summary["filters"]["indirect-no-modes"]["switches"] == {}
+    assert any("run 1,  12.05 s: alignment -> cruise" in line for line in said)
+    # Three steps at each second one: that of the echo, and the two since.
+    heard = (~torch.isnan(make_scene(SHORT).measurements["ultrasonic"])).any(1).sum().item()
+    assert 0.8 * 3 * heard < entry["refiltered"] <= 3 * heard
+    assert json.loads((folder / "metrics.json").read_text()) == json.loads(json.dumps(summary))
+    drawn = {path.name for path in (folder / "figures").iterdir()}
+    assert drawn == {"mission.png", "errors.png", "modes.png", "compare.png"}
+
+
+def test_finished_stages_are_kept(outcome):
+    folder, summary, _ = outcome
+    said = []
+    again = study.run_airship(SHORT, folder, NAMES, say=said.append, figures=False)
+    assert sum("as before" in line for line in said) == 2
+    assert again["filters"] == summary["filters"]
+
+
+def made_up(scene):
+    """Errors of one size in each group, which the filter claims rightly; the heading is away for 2 s."""
+    steps, runs = scene.truth.shape[:2]
+    error = np.zeros((steps, runs, 15))
+    error[..., 0], error[..., 2] = math.radians(0.3), math.radians(2.0)
+    error[..., 3], error[..., 6], error[..., 7], error[..., 8] = 0.1, 0.3, 0.4, 0.2
+    error[:40, :, 2] = math.radians(4.0)
+    error[-20:, :, 8] = 0.05
+    switch = np.full((steps, runs), -1)
+    switch[300, 0] = 1
+    return {
+        "error": error,
+        "nees": np.full((steps, runs), 30.0),
+        "switch": switch,
+        "accepted": np.ones((steps, runs, 5), bool),
+        "ok": np.ones((steps, runs), bool),
+        "refiltered": np.array(7),
+        "cpu_s": np.full(steps, 0.002),
+    }
+
+
+def test_numbers_of_made_up_errors():
+    scene = make_scene(AirshipSettings(runs=2, anchored_s=12.0, cruise_s=6.0, approach_s=6.0))
+    result = made_up(scene)
+    result["accepted"][10, 0, 1] = False
+    result["ok"][5, 1] = False
+    found = study.summarize(result, scene, "indirect")
+    for phase in study.PHASES:
+        part = found[phase]
+        assert part["heading_deg"] == pytest.approx(2.0) and part["tilt_deg"] == pytest.approx(0.3)
+        assert part["velocity_m_s"] == pytest.approx(0.1) and part["horizontal_m"] == pytest.approx(0.5)
+        assert part["nees"] == pytest.approx(2.0)
+    assert found["cruise"]["height_m"] == pytest.approx(0.2) and found["landing_height_m"] == pytest.approx(0.05)
+    assert found["aligned_s"] == pytest.approx(2.0) and found["refiltered"] == 7 and found["failed"] == 1
+    assert found["switches"]["released from the mast before it was aligned"] == 1
+    assert found["refused"]["barometer"] == pytest.approx(1 / result["accepted"][..., 1].size)
+    assert found["ms_per_step"] == pytest.approx(2.0)
+    assert study.log_lines(result, scene, "indirect") == [
+        "run 0,  15.05 s: alignment -> cruise: released from the mast before it was aligned"
+    ]
+    result["error"][:, 0, 2] = result["error"][:, 1, 2] = 1.0
+    assert study.summarize(result, scene, "indirect")["aligned_s"] is None
+    assert "aligned" in "\n".join(study.table({"filters": {"indirect": found}}))
+
+
+def test_nees_of_a_belief_by_hand():
+    scene = make_scene(AirshipSettings(runs=1, anchored_s=1.0, cruise_s=0.0, approach_s=0.0))
+    belief = navigation.make_model(scene, navigation.VARIANTS["indirect"]).prior((1,))
+    error, deviation, nees = study.compare(belief, scene.truth[0])
+    covariance = (belief.factor() @ belief.factor().mT)[0, :15, :15].numpy()
+    expected = error[0].numpy() @ np.linalg.solve(covariance, error[0].numpy())
+    assert nees.item() == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_allclose(deviation[0], np.sqrt(np.diag(covariance)), rtol=1e-12)
+
+
+def test_the_command_line_knows_what_the_study_knows():
+    assert set(run_airship.FILTERS) == set(study.FILTERS) and run_airship.FILTERS[:6] == study.DEFAULT
+
+
+def test_wrong_use_is_told(tmp_path, capsys):
+    assert run_airship.main(["--runs", "0", "--out", str(tmp_path / "a")]) == 2
+    assert "runs must be at least 1, got 0" in capsys.readouterr().err
+    assert run_airship.main(["--filters", "kalman", "--out", str(tmp_path / "a")]) == 2
+    assert "--filters takes" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"filters must be out of .* got kalman"):
+        study.run_airship(SHORT, tmp_path, ("kalman",))
+
+
+# Targets --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_whole_mission():
+    """All runs pass through all modes for the stated reasons, land within centimetres and claim what they are worth.
+
+    Errors of a run are alike for a long time: the band of the NEES is that of one independent sample a run and phase,
+    99.9 %.
+    """
+    settings = AirshipSettings(runs=10)
+    scene = make_scene(settings)
+    found = study.summarize(study.run_filter("indirect", scene), scene, "indirect")
+    assert found["failed"] == 0
+    assert found["switches"]["released from the mast, heading known to 3 deg"] == 10
+    assert found["switches"]["low over the landing spot"] == 10
+    low, high = chi2.ppf([0.0005, 0.9995], 15 * settings.runs) / (15 * settings.runs)
+    for phase in ("cruise", "approach"):
+        assert low < found[phase]["nees"] < high
+    assert found["approach"]["horizontal_m"] < 0.05 and found["landing_height_m"] < 0.03
+    assert found["approach"]["heading_deg"] < 0.5
+
+
+@pytest.mark.slow
+def test_late_readings_taken_for_new_leave_a_bias():
+    """Sinking at 0.2 m/s, a reading that is 0.3 s old is 6 cm too high."""
+    settings = AirshipSettings(runs=6, anchored_s=15.0, cruise_s=20.0, approach_s=60.0, ultrasonic_delay_s=0.3)
+    scene = make_scene(settings)
+    sinking = (scene.phase == 2) & (scene.truth[..., 6].mean(1) < -0.12)
+    assert sinking.sum() > 40
+    heights = {
+        name: study.run_filter(name, scene)["error"][sinking.numpy()][..., 8].mean()
+        for name in ("indirect", "indirect-late-as-new")
+    }
+    assert abs(heights["indirect"]) < 0.01 and heights["indirect-late-as-new"] < -0.02
