@@ -43,8 +43,9 @@ from torchfilt.sensors import Sensors
 # Place and velocity of the gondola at the mast, where it swings: at 20 Hz neighbours are alike for some seconds, so
 # that each counts for less than its spread says.
 MOORED_SD_M, MOORED_SD_M_S = 0.3, 0.2
-# Averages of the first second start the alignment. Of what is left over: accelerometer bias and swing; hard iron.
-_START_S, _FORCE_SD_M_S2, _FIELD_SD_UT = 1.0, 0.1, 1.2
+# Averages of the first second start the alignment. They lie where biases and hard iron have put them, which stay in
+# later readings: five to ten times their deviations, lest the filter count the same errors as independent ones.
+_START_S, _FORCE_SD_M_S2, _FIELD_SD_UT = 1.0, 0.5, 5.0
 # The direct filter's guess of the motion: rates and accelerations of a slow ship.
 RATE_SD_RAD_S, RATE_TIME_S, ACCELERATION_SD_M_S2, ACCELERATION_TIME_S = 0.1, 1.0, 0.1, 1.0
 # Modes end and begin here.
