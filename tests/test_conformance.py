@@ -16,8 +16,10 @@ from torchfilt.gp import GPTransition
 from torchfilt.gp.regression import GPRegression
 from torchfilt.io.starry_night import Camera
 from torchfilt.kernels import Regularize
+from torchfilt.missions.airship import direct
+from torchfilt.missions.airship import navigation as airship_navigation
 from torchfilt.missions.attitude import descent, imu_mag, stars
-from torchfilt.models import landing, relative_motion
+from torchfilt.models import airship, landing, relative_motion
 from torchfilt.models.attitude import ATTITUDE_SPACE, GyroTransition, VectorMeasurement, kinematics
 from torchfilt.models.control import ContinuousLinear, ContinuousTransition, continuous, ss
 from torchfilt.models.inertial import error_model, navigation
@@ -40,7 +42,7 @@ from torchfilt.models.relative_motion import (
     phase,
     simulate_formation,
 )
-from torchfilt.models.sensors import barometer, magnetometer, ultrasonic
+from torchfilt.models.sensors import barometer, magnetometer, ranges, ultrasonic
 from torchfilt.moves import MetropolisHastings
 from torchfilt.resampling import Resampler, ess_below, kld_adaptive
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
@@ -94,6 +96,20 @@ POSES = stars.POSE_SPACE.retract(
 FALLING = descent.DESCENT_SPACE.retract(
     torch.tensor([900.0, -25.0, 0.3, 2.0, -1.0, 0.5, -0.5, 0.5, 0.5, 0.01, 0.0, -0.01], dtype=DOUBLE),
     normal(5, 11, seed=31),
+)
+AFLOAT = airship.AIRSHIP_SPACE.retract(
+    torch.tensor([0.5, -0.5, 0.5, 0.5, 0.0, 1.0, 0.0, 5.0, -2.0, 3.0, 0.0, 0.1, 0.0], dtype=DOUBLE),
+    normal(5, 12, seed=33, scale=0.3),
+)
+SWINGING = torch.cat([HOVER, normal(4, 6, seed=34)], -1)
+DIRECT = direct.DirectTransition(
+    0.05,
+    rate_sd_rad_s=0.1,
+    rate_time_s=1.0,
+    acceleration_sd_m_s2=0.2,
+    acceleration_time_s=2.0,
+    gyro_bias_walk_rad_s_sqrt_s=1e-5,
+    accel_bias_walk_m_s2_sqrt_s=1e-4,
 )
 CAMERA = Camera(torch.tensor([0.5, 0.5, -0.5, 0.5], dtype=DOUBLE), normal(3, seed=26, scale=0.1), 0.24)
 INCREMENTS = torch.cat(increments(FLOWN.dtheta_rad / 0.01, FLOWN.dvelocity_m_s / 0.01, 0.01, 20), -1)
@@ -216,6 +232,17 @@ LAWS = {
     ),
     "UltrasonicRange": (ultrasonic.UltrasonicRange(0.02, 0.01), HOVER, None, None),
     "Magnetometer": (magnetometer.Magnetometer(normal(3, seed=24), 0.2, hard_iron_at=13), HOVER, None, None),
+    "BeaconRanges": (ranges.BeaconRanges(normal(4, 3, seed=35, scale=20.0), 0.03), HOVER, None, None),
+    "AirshipTransition": (airship.AirshipTransition(), AFLOAT, torch.tensor([0.1, 0.0, 0.02], dtype=DOUBLE), 0.1),
+    "DirectTransition": (DIRECT, SWINGING, None, 0.05),
+    "WithAltimeter direct": (
+        barometer.WithAltimeter(DIRECT, 0.4, 0.05, constants=3),
+        torch.cat([SWINGING, normal(4, 5, seed=36)], -1),
+        None,
+        0.05,
+    ),
+    "InertialMeasurement": (direct.InertialMeasurement(0.05, 1e-4, 1e-3), SWINGING, None, None),
+    "Mooring": (airship_navigation._Mooring(22), SWINGING, None, None),
     "NavigationFixes": (NavigationFixes(position_sd_m=2.0, heading_sd_rad=0.1), STATES, None, None),
     "NavigationFixes all, with arms": (
         NavigationFixes(
@@ -307,6 +334,10 @@ def test_every_law_is_registered():
         barometer,
         ultrasonic,
         magnetometer,
+        ranges,
+        airship,
+        direct,
+        airship_navigation,
     )
     shipped = {
         member
