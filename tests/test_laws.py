@@ -1,11 +1,13 @@
 """Conditional laws: what they mean, how functions are called, what is refused."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
 import torchfilt as tf
-from torchfilt.laws import CallStyle, call_style
+from torchfilt.laws import CallStyle, call_style, one_number, row_steps
 
 
 def tensor(value):
@@ -251,3 +253,23 @@ def test_gradients_reach_a_covariance_that_the_caller_owns():
     twin = torch.distributions.MultivariateNormal(OFFSET, root @ root.mT).log_prob(OFFSET + 1)
     (expected,) = torch.autograd.grad(twin, root)
     torch.testing.assert_close(gradient.tril(), expected.tril(), rtol=1e-12, atol=1e-12)
+
+
+def test_one_number_is_taken_as_it_is_or_refused_under_its_name():
+    assert one_number(0.1, "sd_m").dtype == torch.float64
+    assert one_number(0.1, "sd_m", dtype=torch.float32).dtype == torch.float32
+    kept = torch.nn.Parameter(torch.tensor(2.0))
+    assert one_number(kept, "sd_m") is kept and one_number(0.0, "walk", zero=True) == 0
+    for wrong in (0.0, -1.0, math.nan, math.inf, torch.ones(1)):
+        with pytest.raises(ValueError, match="sd_m must be one positive finite number, got"):
+            one_number(wrong, "sd_m")
+    for wrong in (-1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="walk must be one finite number >= 0, got"):
+            one_number(wrong, "walk", zero=True)
+
+
+def test_steps_of_rows_keep_the_precision_of_the_law():
+    like = torch.zeros(1, dtype=torch.float64)
+    assert row_steps(0.1, like) == 0.1 and row_steps(torch.tensor(0.5), like).dtype == torch.float64
+    rows = row_steps(torch.tensor([[0.1], [0.2]], dtype=torch.float64), like.float())
+    assert rows.shape == (2,) and rows.dtype == torch.float32

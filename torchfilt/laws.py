@@ -253,6 +253,27 @@ def check_factor(factor: Tensor, name: str) -> None:
         raise ValueError(f"{name} must be lower triangular, entry {where} is {upper[where].item()}")
 
 
+def row_steps(dt: Tensor | float, like: Tensor) -> Tensor:
+    """Time steps (*lead) of a number or (*lead, 1), in the dtype and on the device of ``like``."""
+    if isinstance(dt, Tensor) and dt.dim() > 0:
+        return dt.squeeze(-1).to(like)
+    return torch.as_tensor(dt, dtype=like.dtype, device=like.device)
+
+
+def one_number(value: Tensor | float, name: str, *, zero: bool = False, dtype: torch.dtype = torch.float64) -> Tensor:
+    """A scalar tensor of one finite number above zero, or of one that may be zero; a tensor stays what it is.
+
+    Raises:
+        ValueError: another number, or several; under its name.
+    """
+    number = value if isinstance(value, Tensor) else torch.tensor(value, dtype=dtype)
+    known = number.detach()
+    if number.dim() != 0 or not bool(torch.isfinite(known) & (known >= 0 if zero else known > 0)):
+        rule = "finite number >= 0" if zero else "positive finite number"
+        raise ValueError(f"{name} must be one {rule}, got {value}")
+    return number
+
+
 def check_finite(tensor: Tensor, name: str) -> None:
     """Raise a ValueError that names the first entry that is not finite."""
     bad = ~torch.isfinite(tensor.detach())

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from torchfilt.missions.airship.direct import DIRECT_SPACE, DirectTransition, InertialMeasurement, to_rates
 from torchfilt.models.landing import LandingTransition
+from torchfilt.spaces import Euclidean, Product
 
 STEP = 0.05
 OPTIONS = {
@@ -224,6 +225,21 @@ def test_measurement_of_a_rigid_motion():
     assert told.is_diagonal and sensor.size == 6
     longer = torch.cat([x, torch.ones(5, 3, dtype=torch.float64)], -1)
     assert torch.equal(sensor(longer).mean, told.mean) and sensor(x.float()).scale_tril.dtype == torch.float32
+
+
+def test_derivative_of_the_measurement_by_autodiff():
+    """In the tangent space of x, large turns of a step, with numbers behind the state: to rounding."""
+    x = torch.cat([states(4, seed=12, rate=8.0), torch.ones(4, 2, dtype=torch.float64)], -1)
+    space, sensor = Product(DIRECT_SPACE, Euclidean(2)), InertialMeasurement(STEP, 1e-4, 1e-3)
+    told, jacobian = sensor.first_order(x)
+    assert jacobian.shape == (4, 6, 23) and torch.equal(told.mean, sensor(x).mean)
+    for row, found in zip(x, jacobian, strict=True):
+
+        def measured(e, row=row):
+            return sensor(space.retract(row, e)).mean
+
+        auto = torch.autograd.functional.jacobian(measured, torch.zeros(23, dtype=torch.float64))
+        torch.testing.assert_close(found, auto, rtol=0, atol=1e-12)
 
 
 def increments_of(before, after):

@@ -102,3 +102,10 @@ def test_radar_alone_teaches_the_force_within_three_orbits() -> None:
     covariance = filtered.covariance[2 * orbit :, :, :6, :6]
     nees = (error.unsqueeze(-2) @ torch.linalg.solve(covariance, error.unsqueeze(-1))).mean()
     assert 3 < nees < 8, nees
+
+
+def test_a_time_step_as_a_number_is_not_rounded_on_its_way() -> None:
+    model, u = law(drift=1e-20), controls(1, 0.1)[0]
+    exact = model.linear_form(u, torch.tensor([0.1], dtype=torch.float64))
+    for one, other in zip(model.linear_form(u, 0.1), exact, strict=True):
+        assert one is other is None or torch.equal(one, other)

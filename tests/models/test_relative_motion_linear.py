@@ -132,3 +132,11 @@ def test_held_matrices_follow_loaded_constants():
     x = torch.ones(6, dtype=torch.float64)
     ours, theirs = law(x, None, 10.0), other(x, None, 10.0)
     assert torch.equal(ours.mean, theirs.mean) and torch.equal(ours.scale_tril, theirs.scale_tril)
+
+
+def test_a_time_step_as_a_number_is_not_rounded_on_its_way():
+    """0.1 s through single precision would be off by 1.5e-9 s."""
+    law = ClohessyWiltshire(N, 3e-9)
+    for one, other in zip(law.linear_form(dt=0.1), law.linear_form(dt=tensor([0.1])), strict=True):
+        assert one is other is None or torch.equal(one, other)
+    np.testing.assert_allclose(law.linear_form(dt=0.1).matrix[0, 3], np.sin(N * 0.1) / N, rtol=1e-15)

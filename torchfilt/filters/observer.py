@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
-from torchfilt.laws import check_finite
+from torchfilt.laws import check_finite, row_steps
 from torchfilt.linalg import apply_factor, log_abs_diagonal, psd_factor, triangularize, whiten
 from torchfilt.models.control.continuous import ContinuousLinear, linear_model
 from torchfilt.models.control.design import kalman
@@ -182,8 +182,7 @@ class LuenbergerObserver(Filter[Gaussian]):
         if observed is None and self.whole is not None:
             transition, push, noise = self.whole.matrices(dt)
         else:
-            step = dt.squeeze(-1) if isinstance(dt, Tensor) and dt.dim() > 0 else dt
-            step = torch.as_tensor(step, dtype=self.a.dtype, device=self.a.device)
+            step = row_steps(dt, self.a)
             a, b, columns = self._driven(gain)
             (transition, push), noise = hold_input(a, b, step), noise_factor(a, columns, step)
         assert push is not None

@@ -5,19 +5,18 @@ milligauss) and axes (forward, right, down) end here.
 """
 
 import io
-import math
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchfilt.io.files import LogError, read_digests, read_stored
-from torchfilt.io.inertial import check_finite, check_samples, check_times, refuse
+from torchfilt.io.inertial import check_samples, check_times, refuse
+from torchfilt.io.tables import read_rows
 
 ARCHIVE = "quad_baro_range.zip"
 # Members that are read, with their columns; the first is the time in ms.
@@ -204,29 +203,5 @@ def _table(name: str, text: str, columns: int) -> Tensor:
     if not text.endswith("\n"):
         raise LogError(f"{name}: row {text.count(chr(10)) + 1}: no line end; the table is cut short")
     lines = text.replace("\r\n", "\n").split("\n")[:-1]
-    try:
-        # Empty lines would be passed over in silence.
-        if not all(line.strip() for line in lines):
-            raise ValueError("an empty row")
-        values = np.loadtxt(lines, comments=None, ndmin=2)
-        if values.shape[1] != columns:
-            raise ValueError(f"{values.shape[1]} columns")
-    except ValueError as error:
-        raise LogError(f"{name}: {_first_fault(lines, columns) or error}") from error
-    table = torch.from_numpy(values)
-    check_finite(name, "this row", table)
+    table = read_rows(name, lines, columns)
     return torch.cat([table[:, :1] / 1000, table[:, 1:]], -1)
-
-
-def _first_fault(lines: list[str], columns: int) -> str:
-    """Row and rule of the first line that is no row of numbers."""
-    for k, line in enumerate(lines, start=1):
-        fields = line.split()
-        if len(fields) != columns:
-            return f"row {k}: {len(fields)} columns, expected {columns}"
-        for field in fields:
-            try:
-                math.isfinite(float(field))
-            except ValueError as error:
-                return f"row {k}: {error}"
-    return ""

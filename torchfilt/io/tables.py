@@ -49,18 +49,31 @@ def read_table(
     columns = header.count(",") + 1
     if label is not None:
         lines, columns = _without(path.name, lines, label), columns - 1
+    table = read_rows(path.name, lines, columns, ",")
+    return Table(path.name, table[:, 0].contiguous(), table[:, 1:])
+
+
+def read_rows(name: str, lines: list[str], columns: int, separator: str | None = None) -> Tensor:
+    """Numbers (t, columns), float64, of lines of text.
+
+    Args:
+        name: of the file, for messages. separator: between numbers; None: white space.
+
+    Raises:
+        LogError: no lines, one that is not as many numbers, a number that is not finite.
+    """
     try:
         # Empty lines would be passed over in silence, no lines with a warning.
-        if not lines or "" in lines:
+        if not all(line.strip() for line in lines) or not lines:
             raise ValueError("no row or an empty one")
-        values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+        values = np.loadtxt(lines, delimiter=separator, comments=None, ndmin=2)
         if values.shape != (len(lines), columns):
             raise ValueError(f"shape {values.shape}")
     except ValueError as error:
-        raise LogError(f"{path.name}: {_first_fault(lines, columns) or error}") from error
+        raise LogError(f"{name}: {_first_fault(lines, columns, separator) or error}") from error
     table = torch.from_numpy(values)
-    check_finite(path.name, "this row", table)
-    return Table(path.name, table[:, 0].contiguous(), table[:, 1:])
+    check_finite(name, "this row", table)
+    return table
 
 
 def _without(name: str, lines: list[str], label: str) -> list[str]:
@@ -74,12 +87,12 @@ def _without(name: str, lines: list[str], label: str) -> list[str]:
     return plain
 
 
-def _first_fault(lines: list[str], columns: int) -> str:
+def _first_fault(lines: list[str], columns: int, separator: str | None) -> str:
     """Row and rule of the first line that is no row of numbers."""
     if not lines:
         return "no rows"
     for k, line in enumerate(lines, start=1):
-        fields = line.split(",")
+        fields = line.split(separator)
         if len(fields) != columns:
             return f"row {k}: {len(fields)} columns, expected {columns}"
         for field in fields:

@@ -13,7 +13,6 @@ The ground is taken as flat: height is range times the cosine of the tilt. The r
 again and again, and in one row for good; the height then predicted is compared with what it read.
 """
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -28,7 +27,8 @@ from torch import Tensor, nn
 import torchfilt as tf
 from torchfilt.io.quad_baro_range import QuadBaroRange, read_quad_baro_range
 from torchfilt.laws import LinearForm
-from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.missions.attitude.study import digest, run_study
+from torchfilt.missions.stages import Arrays, check_names
 from torchfilt.models.attitude import multiply, rotate
 from torchfilt.models.attitude.kinematics import ATTITUDE_SPACE, GyroTransition, VectorMeasurement
 from torchfilt.models.attitude.rotations import from_rotation_vector
@@ -505,29 +505,18 @@ def run_height(
     """
     names = FILTERS if filters is None else tuple(filters)
     check_names(names, FILTERS, "filters")
-    folder = Path(out)
-    stages = Stages(folder / "stages", say)
     flight = make_flight(read_quad_baro_range(settings.data), settings)
-    digest = hashlib.sha256()
-    for value in flight:
-        digest.update(value.numpy().tobytes() if isinstance(value, Tensor) else str(value).encode())
-    results: dict[str, Arrays] = {}
-    summary: dict[str, Any] = {"filters": {}}
-    for name in names:
-        recipe = {"version": _VERSION, **asdict(settings), "flight": digest.hexdigest()}
-        kept = stages.has(name, recipe)
-        results[name] = stages.get(name, recipe, lambda name=name: follow(name, flight, settings, progress))  # type: ignore[misc]
-        summary["filters"][name] = summarize(results[name], flight, settings)
-        say(f"{name}: {'as before' if kept else format(results[name]['cpu_s'], '.1f') + ' s of CPU'}")
-    summary |= {"settings": asdict(settings), "versions": versions()}
-    lines = table(summary)
-    for line in lines:
-        say(line)
-    write_outcome(folder, lines, summary)
-    if figures:
-        for path in _figures(results, flight, settings, folder / "figures"):
-            say(f"wrote {path}")
-    return summary
+    return run_study(
+        names,
+        settings,
+        {"version": _VERSION, "flight": digest(flight)},
+        out,
+        follow=lambda name: follow(name, flight, settings, progress),
+        summarize=lambda result: summarize(result, flight, settings),
+        table=table,
+        draw=(lambda results, folder: _figures(results, flight, settings, folder)) if figures else None,
+        say=say,
+    )
 
 
 def _figures(results: dict[str, Arrays], flight: Flight, settings: HeightSettings, folder: Path) -> list[Path]:

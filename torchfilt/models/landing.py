@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import hold
+from torchfilt.laws import hold, one_number
 from torchfilt.model import StateSpaceModel
 from torchfilt.models.attitude import mean_rotation, skew, to_matrix
 from torchfilt.models.inertial.imu import ImuGrade
@@ -263,7 +263,7 @@ class Barometer(nn.Module):
 
     def __init__(self, sd_m: Tensor | float) -> None:
         super().__init__()
-        hold(self, "deviation", _deviation("sd_m", sd_m, 1))
+        hold(self, "deviation", one_number(sd_m, "sd_m").reshape(1))
 
     def forward(self, x: Tensor) -> Gaussian:
         """Law of the reading (..., 1) at states (..., 16 or 17)."""
@@ -319,7 +319,7 @@ class Beacon(nn.Module):
             raise ValueError(f"edge_rad must lie between the picture's corner, {corner:.4g}, and pi/2, got {edge_rad}")
         if not range_m > 0:
             raise ValueError(f"range_m must be positive, got {range_m}")
-        hold(self, "deviation", _deviation("sd_rad", sd_rad, 2))
+        hold(self, "deviation", torch.stack([one_number(sd_rad, "sd_rad")] * 2))
         self.limits, self.range_m, self.edge = limits, range_m, math.tan(edge_rad)
 
     @property
@@ -369,13 +369,6 @@ def _to_pad(x: Tensor) -> Vector:
     """Vector from the vehicle to the pad in body axes, m."""
     across, along, up = rotate_back(quaternion(x[..., :4]), vector(x[..., 7:10].unbind(-1)))
     return -across, -along, -up
-
-
-def _deviation(name: str, value: Tensor | float, size: int) -> Tensor:
-    given = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
-    if given.dim() != 0 or not bool((given.detach() > 0) & (given.detach() < math.inf)):
-        raise ValueError(f"{name} must be one positive finite number, got {value}")
-    return torch.stack([given] * size)
 
 
 # Symmetry -------------------------------------------------------------------------------------------------------------

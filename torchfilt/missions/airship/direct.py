@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import hold
-from torchfilt.models.attitude import from_rotation_vector, inverse, mean_rotation, multiply, rotate, to_matrix
+from torchfilt.models.attitude import from_rotation_vector, inverse, mean_rotation, multiply, rotate, skew, to_matrix
 from torchfilt.models.landing import GRAVITY_M_S2
 from torchfilt.spaces import Euclidean, Product, UnitQuaternion
 
@@ -163,10 +163,31 @@ class InertialMeasurement(nn.Module):
 
     def forward(self, x: Tensor) -> Gaussian:
         """Law of rate, rad/s, and specific force, m/s^2, both in body axes, at states (..., 22 or more)."""
+        force, _, _ = self._sensed(x)
+        return self._law(x, force)
+
+    def first_order(self, x: Tensor, u: Tensor | None = None, dt: Step = None) -> tuple[Gaussian, Tensor]:
+        """The law at x and its derivative (..., 6, d - 1)."""
+        force, push, middle = self._sensed(x)
+        to_body, half = to_matrix(middle).mT, self.step_s / 2
+        # A turn e of the world changes the force by the middle's axes of push x e; one of the rate, by half a step's
+        # turn of these axes.
+        by_rate = -half * (skew(force) @ mean_rotation(half * x[..., _RATE]))
+        eye = torch.eye(3, dtype=x.dtype, device=x.device).expand_as(to_body)
+        rest = x.shape[-1] - DIRECT_SPACE.size
+        rates = pad(torch.cat([eye, torch.zeros_like(eye), eye], -1), (9, 3 + rest))
+        forces = torch.cat([pad(to_body @ skew(push), (0, 9)), eye, by_rate, to_body], -1)
+        return self._law(x, force), torch.cat([rates, pad(forces, (0, rest))], -2)
+
+    def _sensed(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Specific force in body and in world axes, attitude in the middle of the step."""
         if x.shape[-1] < DIRECT_SPACE.size:
             raise ValueError(f"the state must have {DIRECT_SPACE.size} numbers or more, got {tuple(x.shape)}")
         middle = multiply(x[..., :4], from_rotation_vector(-self.step_s / 2 * x[..., _RATE]))
-        force = rotate(inverse(middle), x[..., _ACCELERATION] + x.new_tensor([0, 0, GRAVITY_M_S2]))
+        push = x[..., _ACCELERATION] + x.new_tensor([0, 0, GRAVITY_M_S2])
+        return rotate(inverse(middle), push), push, middle
+
+    def _law(self, x: Tensor, force: Tensor) -> Gaussian:
         mean = torch.cat([x[..., _RATE] + x[..., 10:13], force + x[..., 13:16]], -1)
         return Gaussian(mean, self.deviation.to(x.dtype), is_diagonal=True)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import LinearForm, LinearGaussian, call_style, check_finite, hold
+from torchfilt.laws import LinearForm, LinearGaussian, call_style, check_finite, hold, row_steps
 from torchfilt.linalg import apply_factor, for_points, is_differentiated, psd_factor, triangularize
 from torchfilt.model import StateSpaceModel
 from torchfilt.models.control.systems import as_system, hold_input, noise_factor, state_noise
@@ -155,8 +155,7 @@ class ContinuousLinear(nn.Module):
         return result
 
     def _make(self, dt: Tensor | float) -> tuple[Tensor, Tensor | None, Tensor]:
-        step = dt.squeeze(-1) if isinstance(dt, Tensor) and dt.dim() > 0 else dt
-        step = torch.as_tensor(step, dtype=self.a.dtype, device=self.a.device)
+        step = row_steps(dt, self.a)
         a = for_points(self.a, 2, step.dim())
         columns = for_points(self.noise(), 2, step.dim())
         b = a.new_zeros(*a.shape[:-1], 0) if self.b is None else for_points(self.b, 2, step.dim())

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import LinearForm, check_finite, hold
+from torchfilt.laws import LinearForm, check_finite, hold, row_steps
 from torchfilt.linalg import triangularize
 from torchfilt.models.relative_motion.transforms import apply_matrix
 
@@ -120,7 +120,7 @@ class ClohessyWiltshire(nn.Module):
 
     def _make(self, dt: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
         n, psd = self.mean_motion_rad_s, self.acceleration_psd_m2_s3
-        step = dt.squeeze(-1).to(n) if isinstance(dt, Tensor) and dt.dim() > 0 else torch.as_tensor(dt).to(n)
+        step = row_steps(dt, n)
         return cw_transition(n, step), cw_input(n, step), cw_noise_factor(n, step, psd)
 
     def _matrices(self, dt: Step) -> tuple[Tensor, Tensor, Tensor]:

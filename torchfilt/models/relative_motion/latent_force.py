@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
 from torchfilt.gp.fourier import harmonics
-from torchfilt.laws import LinearForm, hold
+from torchfilt.laws import LinearForm, hold, row_steps
 from torchfilt.models.relative_motion.chief import Control, orbit_phase, split_control
 from torchfilt.models.relative_motion.clohessy_wiltshire import ClohessyWiltshire, cw_input
 from torchfilt.models.relative_motion.transforms import apply_matrix, block_diagonal
@@ -58,7 +58,7 @@ class HarmonicForce(nn.Module):
         motion = self.law.linear_form(u, step)
         basis = self._basis(control).to(motion.matrix)
         n = self.law.mean_motion_rad_s
-        length = step.squeeze(-1).to(n) if isinstance(step, Tensor) and step.dim() > 0 else torch.as_tensor(step).to(n)
+        length = row_steps(step, n)
         push = cw_input(n, length)
         # Column block of axis a: response to a unit acceleration along it, times the harmonics.
         force = (push.unsqueeze(-1) * basis[..., None, None, :]).flatten(-2)

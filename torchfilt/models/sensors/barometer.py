@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import hold
+from torchfilt.laws import hold, one_number
 from torchfilt.models.sensors import atmosphere
 from torchfilt.spaces import Euclidean, Product, Space
 
@@ -113,7 +113,7 @@ class WithAltimeter(nn.Module):
         curved = inner.size - inner.tangent_size
         if not 0 <= height - curved < inner.tangent_size:
             raise ValueError(f"height must be an index in {curved}..{inner.size - 1} of the state, got {height}")
-        hold(self, "walk", _walk(offset_walk))
+        hold(self, "walk", one_number(0.0 if offset_walk is None else offset_walk, "offset_walk", zero=True))
         self.law: Any = law
         self.height, self.time_constant_s = height, time_constant_s
         self.lags, self.drifts, self.constants = (
@@ -188,13 +188,6 @@ class WithAltimeter(nn.Module):
         return dt
 
 
-def _walk(given: Tensor | float | None) -> Tensor:
-    walk = given if isinstance(given, Tensor) else torch.tensor(given or 0.0, dtype=torch.float64)
-    if walk.dim() != 0 or not bool((walk.detach() >= 0) & (walk.detach() < math.inf)):
-        raise ValueError(f"offset_walk must be one finite number >= 0, got {given}")
-    return walk
-
-
 def _appended(space: Space, extra: int) -> Space:
     """The space with Euclidean numbers behind it; Euclidean neighbours merged."""
     parts = list(space.spaces) if isinstance(space, Product) else [space]
@@ -258,9 +251,8 @@ class BarometricAltimeter(nn.Module):
         if (sd_pa is None) == (sd_m is None):
             raise ValueError("give exactly one of sd_pa= and sd_m=: what the sensor puts out")
         name, given = ("sd_pa", sd_pa) if sd_m is None else ("sd_m", sd_m)
-        deviation = given if isinstance(given, Tensor) else torch.tensor(given, dtype=torch.float64)
-        if deviation.dim() != 0 or not bool((deviation.detach() > 0) & (deviation.detach() < math.inf)):
-            raise ValueError(f"{name} must be one positive finite number, got {given}")
+        assert given is not None
+        deviation = one_number(given, name)
         for label, index in (("height", height), ("lagged", lagged), ("offset", offset)):
             if index is not None and index < 4:
                 raise ValueError(f"{label} must be an index behind the quaternion, 4 or more, got {index}")

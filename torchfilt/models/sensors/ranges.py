@@ -1,13 +1,11 @@
 """Ranges to beacons at known places, such as ultrasonic ones on the walls of a hall."""
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import check_finite, hold
+from torchfilt.laws import check_finite, hold, one_number
 
 Step = Tensor | float | None
 
@@ -34,9 +32,7 @@ class BeaconRanges(nn.Module):
         if beacons_m.dim() != 2 or beacons_m.shape[1] != 3 or len(beacons_m) == 0:
             raise ValueError(f"beacons_m must be (b, 3) with b >= 1, got {tuple(beacons_m.shape)}")
         check_finite(beacons_m, "beacons_m")
-        deviation = sd_m if isinstance(sd_m, Tensor) else torch.tensor(sd_m, dtype=beacons_m.dtype)
-        if deviation.dim() != 0 or not bool((deviation.detach() > 0) & (deviation.detach() < math.inf)):
-            raise ValueError(f"sd_m must be one positive finite number, got {sd_m}")
+        deviation = one_number(sd_m, "sd_m", dtype=beacons_m.dtype)
         if position < 4:
             raise ValueError(f"position must be an index behind the quaternion, 4 or more, got {position}")
         self.size, self.position = len(beacons_m), position

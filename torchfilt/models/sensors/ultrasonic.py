@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import hold
+from torchfilt.laws import hold, one_number
 from torchfilt.quaternions import quaternion, rotate, stack, vector
 
 Step = Tensor | float | None
@@ -68,13 +68,7 @@ class UltrasonicRange(nn.Module):
         height: int = 9,
     ) -> None:
         super().__init__()
-        least, share = (
-            v if isinstance(v, Tensor) else torch.tensor(v, dtype=torch.float64) for v in (noise_m, noise_share)
-        )
-        if least.dim() != 0 or not bool((least.detach() > 0) & (least.detach() < math.inf)):
-            raise ValueError(f"noise_m must be one positive finite number, got {noise_m}")
-        if share.dim() != 0 or not bool((share.detach() >= 0) & (share.detach() < math.inf)):
-            raise ValueError(f"noise_share must be one finite number >= 0, got {noise_share}")
+        least, share = one_number(noise_m, "noise_m"), one_number(noise_share, "noise_share", zero=True)
         for name, angle in (("half_angle_rad", half_angle_rad), ("max_tilt_rad", max_tilt_rad)):
             if not 0 <= angle < math.radians(80):
                 raise ValueError(f"{name} must be at least 0 and below 80 degrees, {math.radians(80):.4g}, got {angle}")
