@@ -27,6 +27,7 @@ from torch.nn.functional import pad
 import torchfilt as tf
 from torchfilt.io.rocket_descent import RocketDescent, read_rocket_descent
 from torchfilt.laws import hold
+from torchfilt.linalg import matrix_exp
 from torchfilt.missions.attitude.motion import to_ends
 from torchfilt.missions.attitude.study import digest, run_study
 from torchfilt.missions.stages import Arrays, check_names
@@ -38,6 +39,7 @@ from torchfilt.models.attitude import (
     to_rotation_vector,
 )
 from torchfilt.models.attitude.kinematics import GyroTransition
+from torchfilt.models.sensors import atmosphere
 from torchfilt.spaces import EUCLIDEAN, Euclidean, Product, UnitQuaternion
 
 __all__ = [
@@ -62,11 +64,8 @@ FILTERS = ("baro-ekf", "baro-ukf", "imu-mekf", "imu-ukf", "imu-llpf")
 # Height, velocity and acceleration up, accelerations east and north; attitude; gyro bias.
 DESCENT_SPACE = Product(Euclidean(5), UnitQuaternion("left"), Euclidean(3))
 # Results of another version of the arithmetic are not reused: raise this with it.
-_VERSION = 1
+_VERSION = 2
 _GRAVITY_M_S2 = 9.80665
-# U.S. Standard Atmosphere 1976, tables 2 and 4: temperature at sea level over the lapse rate, and g M / (R lapse).
-_SCALE_M = 288.15 / 6.5e-3
-_POWER = 9.80665 * 0.0289644 / (8.31432 * 6.5e-3)
 # A second of the barometer about the end of a gap is what the prediction is compared with.
 _COMPARED_S = 1.0
 
@@ -153,16 +152,13 @@ class Descent(NamedTuple):
 
 
 def standard_pressure(height_m: Tensor, ground_pa: Tensor | float) -> Tensor:
-    """Pressure in Pa at a height (...) in m above where it is ground_pa, below the tropopause.
-
-    Source: U.S. Standard Atmosphere 1976, equation 33a.
-    """
-    return ground_pa * (1 - height_m / _SCALE_M) ** _POWER
+    """Pressure in Pa at a height (...) in m above where it is ground_pa, the standard atmosphere scaled to it."""
+    return ground_pa / atmosphere.SEA_LEVEL_PRESSURE_PA * atmosphere.pressure_pa(height_m, check=False)
 
 
 def pressure_height(pressure_pa: Tensor, ground_pa: Tensor | float) -> Tensor:
     """Height (...) in m: the inverse of `standard_pressure`."""
-    return _SCALE_M * (1 - (pressure_pa / ground_pa) ** (1 / _POWER))
+    return atmosphere.height_m(pressure_pa / ground_pa * atmosphere.SEA_LEVEL_PRESSURE_PA, check=False)
 
 
 # Laws -----------------------------------------------------------------------------------------------------------------
@@ -180,7 +176,7 @@ def gauss_markov(dt: float, time_s: float, sd: float, dtype: torch.dtype = torch
     flow = torch.zeros(6, 6, dtype=torch.float64)
     drift = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1 / time_s]], dtype=torch.float64)
     flow[:3, :3], flow[3:, 3:], flow[2, 5] = -drift, drift.mT, 2 * sd**2 / time_s
-    whole = torch.linalg.matrix_exp(flow * dt)
+    whole = matrix_exp(flow * dt)
     transition = whole[3:, 3:].mT.contiguous()
     noise = transition @ whole[:3, 3:]
     return transition.to(dtype), torch.linalg.cholesky((noise + noise.mT) / 2).to(dtype)
@@ -202,15 +198,20 @@ class Barometer(nn.Module):
 
     def forward(self, x: Tensor) -> tf.Gaussian:
         """Law of the pressure (..., 1) at states (..., d)."""
-        mean = standard_pressure(x[..., :1] - self.lag_s * x[..., 1:2], self.ground_pa)
+        mean = standard_pressure(self._then(x), self.ground_pa)
         return tf.Gaussian(mean, x.new_full((1,), self.sd_pa), EUCLIDEAN, is_diagonal=True)
 
     def first_order(self, x: Tensor, u: Tensor | None = None, dt: Step = None) -> tuple[tf.Gaussian, Tensor]:
         """The law at x and its derivative (..., 1, e) by the error of x."""
         law = self(x)
-        slope = -_POWER * law.mean / (_SCALE_M - x[..., :1] + self.lag_s * x[..., 1:2])
+        temperature = atmosphere.temperature_k(self._then(x), check=False)
+        slope = -atmosphere.GRAVITY_M_S2 * law.mean / (atmosphere.GAS_CONSTANT_J_KG_K * temperature)
         row = pad(torch.cat([slope, -self.lag_s * slope], -1), (0, self.tangent_size - 2))
         return law, row.unsqueeze(-2)
+
+    def _then(self, x: Tensor) -> Tensor:
+        """Height (..., 1) lag_s ago."""
+        return x[..., :1] - self.lag_s * x[..., 1:2]
 
 
 class SpecificForce(nn.Module):
