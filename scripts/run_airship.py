@@ -51,6 +51,7 @@ def build_parser() -> ArgumentParser:
     group.add_argument("--gust-sd-m-s", default=0.05, type=float, metavar="V", help="of the air's velocity")
     group.add_argument("--ultrasonic-delay-s", default=0.1, type=float, metavar="S", help="of the sonar's readings")
     group.add_argument("--barometer-lag-s", default=0.5, type=float, metavar="S", help="time constant")
+    group.add_argument("--clutter-m", default=0.8, type=float, metavar="H", help="height of tables in the hall")
     group.add_argument(
         "--pillar-moment-a-m2", default=0.0, type=float, metavar="M", help="magnetic moment of a steel pillar"
     )
@@ -72,7 +73,7 @@ def _run(options: dict[str, Any]) -> None:
     from torchfilt.missions.airship.study import run_airship
 
     own = ("runs", "seed", "anchored_s", "cruise_s", "approach_s", "gust_sd_m_s", "ultrasonic_delay_s")
-    own += ("barometer_lag_s", "pillar_moment_a_m2")
+    own += ("barometer_lag_s", "clutter_m", "pillar_moment_a_m2")
     try:
         settings = AirshipSettings(**{name: options[name] for name in own})
     except ValueError as error:

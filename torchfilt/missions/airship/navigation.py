@@ -285,7 +285,7 @@ SWITCHES = (
 
 
 def _sensors(mode: str, variant: Variant) -> tuple[str, ...]:
-    """Names of the sensors that a mode listens to; below cruising heights the floor is flat and free."""
+    """Names of the sensors that a mode listens to: the sonar only where the floor is clear."""
     always = ("barometer", "magnetometer", *(["imu"] if variant.direct else []))
     return {
         ALIGNMENT: ("mast", *always),

@@ -4,9 +4,10 @@ The path is that of the airship's equations of motion under a controller that kn
 air velocity, constant over each step. The inertial sensors and all others ride in the gondola; the truth that
 navigation is asked for is the gondola's.
 
-Horizontal position is not observable from inertial sensors, barometer, sonar and magnetometer: all of them stay the
-same under a shift of the whole hall. Ranges to ultrasonic beacons at the hall's upper corners make it observable, and
-with it, as soon as the ship accelerates, the heading.
+Horizontal position is not observable from inertial sensors, barometer, magnetometer and a sonar over a clear floor: all
+of them stay the same under a shift of the whole hall. Ranges to ultrasonic beacons at the hall's upper corners make it
+observable, and with it, as soon as the ship accelerates, the heading. Tables stand in the hall: what the sonar measures
+above them is not the height.
 """
 
 import math
@@ -38,6 +39,8 @@ LANDED_HEIGHT_M = 1.2
 BEACONS_M = ((0.5, 0.5, 7.0), (39.5, 0.5, 7.8), (39.5, 19.5, 7.0), (0.5, 19.5, 7.8))
 """Not in one plane with each other, so that the height is not mirrored."""
 PILLAR_M = (20.0, 12.0, 2.0)
+CLEAR_M = 5.0
+"""So far around the landing spot, and around the mast, the floor is clear."""
 ANCHORED, CRUISE, APPROACH = range(3)
 
 TRUTH_NAMES = (
@@ -82,6 +85,7 @@ class AirshipSettings:
     barometer_hz, barometer_sd_m, barometer_lag_s, barometer_offset_sd_m, barometer_walk_m_sqrt_s: rate, noise, time
         constant, offset at the start and its random walk.
     ultrasonic_hz, ultrasonic_delay_s, ultrasonic_dropout: of the sonar below; the delay is a whole number of steps.
+    clutter_m: height of the tables in the hall, which the sonar sees instead of the floor; 0 for none.
     magnetometer_hz, magnetometer_sd_ut, hard_iron_sd_ut: hard iron that a calibration has left over, constant.
     pillar_moment_a_m2: magnetic moment of a steel pillar, pointing up; 0 for none.
     beacon_hz, beacon_sd_m, beacon_dropout: ranges to the beacons.
@@ -110,6 +114,7 @@ class AirshipSettings:
     ultrasonic_hz: int = 10
     ultrasonic_delay_s: float = 0.1
     ultrasonic_dropout: float = 0.05
+    clutter_m: float = 0.8
     magnetometer_hz: int = 10
     magnetometer_sd_ut: float = 0.5
     hard_iron_sd_ut: float = 1.0
@@ -372,6 +377,16 @@ def field_ut(settings: AirshipSettings, position: Tensor) -> Tensor:
     return earth + 0.1 * settings.pillar_moment_a_m2 * (3 * ray[..., 2:] * ray - up) / distance**3
 
 
+def clutter_m(settings: AirshipSettings, position: Tensor) -> Tensor:
+    """Height (...) of what stands on the floor below positions (..., 3): tables of 4 m by 3 m, like a chessboard."""
+    across, along = (position[..., k] / size for k, size in ((0, 4.0), (1, 3.0)))
+    table = (across.floor() + along.floor()) % 2 == 0
+    clear = [
+        torch.linalg.vector_norm(position[..., :2] - position.new_tensor(p[:2]), dim=-1) for p in (LANDING_M, MAST_M)
+    ]
+    return settings.clutter_m * (table & (torch.minimum(*clear) > CLEAR_M)).to(position.dtype)
+
+
 def ultrasonic_law(settings: AirshipSettings) -> UltrasonicRange:
     """The sonar below the gondola: 1 cm and 0.5 % of the range, 15 degrees, 0.25 m to 6 m."""
     return UltrasonicRange(0.01, 0.005, min_range_m=0.25, max_range_m=6.0, delay_s=settings.ultrasonic_delay_s)
@@ -384,7 +399,9 @@ def _measure(settings: AirshipSettings, seeds: list[int], truth: Tensor) -> dict
     barometer = BarometricAltimeter(sd_m=settings.barometer_sd_m, lagged=LAGGED, offset=OFFSET)
     magnetometer = Magnetometer(field_ut(settings, now[..., 7:10]), settings.magnetometer_sd_ut, hard_iron_at=HARD_IRON)
     heard = torch.arange(settings.steps) + 1 - round(settings.ultrasonic_delay_s * FILTER_RATE_HZ)
-    echo = ultrasonic_law(settings).simulate(truth[heard.clamp_min(0)], seeded_normals(seeds, (*count, 1), _ULTRASONIC))
+    above = truth[heard.clamp_min(0)].clone()
+    above[..., 9] -= clutter_m(settings, above[..., 7:10])
+    echo = ultrasonic_law(settings).simulate(above, seeded_normals(seeds, (*count, 1), _ULTRASONIC))
     echo = echo.masked_fill((heard < 0)[:, None, None], math.nan)
     arm = now[..., None, 7:10] - now.new_tensor(BEACONS_M)
     ranges = torch.linalg.vector_norm(arm, dim=-1)
