@@ -3,6 +3,7 @@
 import re
 import runpy
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -32,6 +33,18 @@ def test_the_readmes_example_runs_and_prints_what_the_readme_says(capsys: pytest
     for name, value in claimed.items():
         # Two digits: the last bits of the training may differ between machines, the claim may not.
         assert float(errors[name]) == pytest.approx(float(value), rel=0.05)
+
+
+def test_the_example_on_modes_prints_what_the_page_says(capsys: pytest.CaptureFixture[str]) -> None:
+    section = (ROOT / "docs" / "filters.md").read_text().split("\n## Modes\n")[1].split("\n## ")[0]
+    example, printed = re.findall(r"```(?:python)?\n(.*?)```", section, flags=re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(compile(example, "docs/filters.md", "exec"), names)
+    assert capsys.readouterr().out == printed
+    history, truth = names["history"], names["truth"]
+    # The sonar's 2 cm count at the end of the first row only; what the barometer alone knows is within 1 m.
+    assert abs(float(history.mean[-1, 0, 0] - truth[-1, 0])) < 0.06
+    assert abs(float(history.mean[-1, 1, 0] - truth[-1, 1])) < 1.0
 
 
 def test_the_examples_on_orientations_run_and_agree() -> None:
