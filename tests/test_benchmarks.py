@@ -149,6 +149,26 @@ def test_result_is_written_between_the_marks(bench, tmp_path):
         bench.harness.write_result(str(script), "new")
 
 
+# Observers ------------------------------------------------------------------------------------------------------------
+
+
+def test_observer_rows_of_a_kind_agree_and_a_wrong_one_is_found():
+    pytest.importorskip("filterpy")
+    bench = loaded("bench_observers")
+    problem = bench.problems.constant_velocity(30, 4)
+    rows = bench.rows_of(problem)
+    timings = {name: bench.harness.Timing(0.0, [], row.run()) for name, (_, row) in rows.items()}
+    kinds = {name: kind for name, (kind, _) in rows.items()}
+    bench.check(kinds, timings)
+    # The two kinds differ at the start and have settled to one gain at the end.
+    best, constant = (np.asarray(timings[name].outputs) for name in (bench.BASE, "torchfilt steady state"))
+    assert np.abs(best[0] - constant[0]).max() > 0.1 and np.abs(best[-1] - constant[-1]).max() < 0.05
+    for name in timings:
+        wrong = timings | {name: bench.harness.Timing(0.0, [], timings[name].outputs + 1e-8)}
+        with pytest.raises(AssertionError, match="means are off by"):
+            bench.check(kinds, wrong)
+
+
 # The inertial problem ------------------------------------------------------------------------------------------------
 
 
