@@ -4,7 +4,7 @@
 
 CPU time of one thread, float64, whole series in one call; medians over interleaved rounds. The NumPy loops are what one
 would write by hand for these matrices, all series at once, without log-likelihood or checks; filterpy takes one series
-after the other, without log-likelihood too (it is computed when asked for). Every run checks that the rows of a kind give
+after the other, without log-likelihood too (it computes it when asked). Every run checks that the rows of a kind give
 the same means. The last run shared its cores with other work: look at the ratios. `--write` puts the result here:
 
 -- last result --
