@@ -8,6 +8,7 @@ import torch
 
 import torchfilt as tf
 from torchfilt.modes import Mode, NavigationModes, Situation, Switch, Switched, switches
+from torchfilt.types import Moded
 
 DOUBLE, DT = torch.float64, 0.5
 
@@ -201,6 +202,30 @@ def test_compiled_and_single_precision(dtype):
         belief, info = step(belief, ys[k], None, DT)
         assert info.nis.dtype == belief.belief.mean.dtype == belief.since_s.dtype == dtype
     torch.testing.assert_close(belief.mean, history.mean[-1], rtol=0, atol=20 * torch.finfo(dtype).eps)
+    _, info = step(modes.init().belief, ys[0, 0], None, DT)  # no batch: the answers of both filters are numbers
+    torch.testing.assert_close(info.nis, history.diagnostics.nis[0, 0], rtol=0, atol=20 * torch.finfo(dtype).eps)
+
+
+def test_rows_may_be_mapped():
+    model = make_model(curved=True)
+    modes = make_modes(model, (tf.GaussianFilter(model, tf.moments.taylor()), tf.UnscentedKalmanFilter(model)))
+    belief, ys = modes.init((3,)).belief, series(1)[0]
+    mode = torch.tensor([0, 1, 0])
+
+    def after(mean, factor, mode, since_s, y):
+        found, _ = modes.advance(Moded(tf.Gaussian(mean, factor), mode, since_s), y, None, DT)
+        return found.belief.mean, found.belief.scale_tril, found.mode, found.since_s
+
+    given = belief.belief.mean, belief.belief.scale_tril, mode, belief.since_s, ys
+    for mapped, plain in zip(torch.func.vmap(after)(*given), after(*given), strict=True):
+        torch.testing.assert_close(mapped, plain, rtol=1e-12, atol=1e-14)
+
+
+def test_no_time_goes_by_where_the_first_measurement_is_of_the_priors_own():
+    modes = make_modes(make_model(), ways=(Switch("near", "away", "by its clock", since(1.0)),))
+    history = modes(series(3), dt=DT, predict_first=False)
+    assert [now.step for now in switches(history, modes)] == [2] * 3  # a second is over with the third measurement
+    same(modes(series(3)[:2], dt=DT, predict_first=False).final.belief.since_s, torch.full((3,), DT, dtype=DOUBLE))
 
 
 def test_named_measurements_time_steps_of_rows_and_controls():

@@ -138,7 +138,7 @@ class NavigationModes(Filter[Moded]):
         heard = torch.where(self.allowed[belief.mode], y, torch.nan)
         after, info = self._filtered(belief, heard, u, dt, noise, predict)
         span = dt.squeeze(-1) if isinstance(dt, Tensor) and dt.dim() else dt
-        since = belief.since_s + span
+        since = belief.since_s + span if predict else belief.since_s  # at the prior's own time none has gone by
         measured = {
             name: ~torch.isnan(y[..., own]).any(-1)
             for name, own in zip(self._sensors.names, self._sensors.columns, strict=True)
@@ -152,10 +152,13 @@ class NavigationModes(Filter[Moded]):
     ) -> tuple[Any, StepInfo]:
         """Each filter that a row needs, and of its answers the rows that asked."""
         found: tuple[Any, StepInfo] | None = None
+        traced = torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
         for one, modes in zip(self.filters, self._runs, strict=True):
-            rows = torch.isin(belief.mode, belief.mode.new_tensor(modes)) if len(self.filters) > 1 else None
-            if rows is not None and not torch.compiler.is_compiling() and not bool(rows.any()):
-                continue
+            rows = None
+            if len(self.filters) > 1:
+                rows = (belief.mode.unsqueeze(-1) == belief.mode.new_tensor(modes)).any(-1)
+                if not traced and not bool(rows.any()):
+                    continue
             tracker: Any = one
             new = tracker.advance(belief.belief, y, u, dt, noise, "rows", predict)
             found = new if found is None or rows is None else _merged(rows, new, found)
@@ -184,7 +187,7 @@ def _merged(rows: Tensor, new: tuple[Any, StepInfo], old: tuple[Any, StepInfo]) 
         if not isinstance(a, Tensor):
             return a
         room = max(a.dim(), b.dim()) - rows.dim()
-        return torch.where(rows.reshape(*rows.shape, *[1] * room), a, b)
+        return torch.where(rows.reshape(rows.shape + (1,) * room), a, b)
 
     return choose(rows, new[0], old[0]), StepInfo(*(pick(a, b) for a, b in zip(new[1], old[1], strict=True)))
 

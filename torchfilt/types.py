@@ -78,7 +78,7 @@ def choose(rows: Tensor, yes: Any, no: Any) -> Any:
     """Beliefs of ``yes`` in the rows (*batch) that are set, of ``no`` in the others; Gaussians or particles."""
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(rows.reshape(*rows.shape, *[1] * (b.dim() - rows.dim())), a, b)
+        return torch.where(rows.reshape(rows.shape + (1,) * (b.dim() - rows.dim())), a, b)
 
     if isinstance(no, Gaussian):
         return Gaussian(pick(yes.mean, no.mean), pick(yes.scale_tril, no.scale_tril), no.space)
