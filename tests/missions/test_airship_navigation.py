@@ -340,8 +340,8 @@ ALIGNED, RELEASED, LOW, HIGH, LOST = nav.SWITCHES
     [
         (ALIGNED, {}, True),
         (ALIGNED, {"mast": True}, False),
-        (ALIGNED, {"heading_deg": 2.99}, True),
-        (ALIGNED, {"heading_deg": 3.01}, False),
+        (ALIGNED, {"heading_deg": 4.99}, True),
+        (ALIGNED, {"heading_deg": 5.01}, False),
         (ALIGNED, {"since_s": 9.9}, False),
         (ALIGNED, {"since_s": 10.0}, True),
         (RELEASED, {"heading_deg": 90.0, "since_s": 0.1}, True),
@@ -471,7 +471,7 @@ def test_mission_goes_through_its_modes(mission, name):
     for row in range(4):
         log = [one for one in switches(history, filter) if one.row == (row,)]
         assert [(one.source, one.target, one.reason) for one in log[:2]] == [
-            ("alignment", "cruise", "released from the mast, heading known to 3 deg"),
+            ("alignment", "cruise", "released from the mast, heading known to 5 deg"),
             ("cruise", "approach", "low over the landing spot"),
         ]
         assert log[0].step == 240 and mission.truth[log[1].step, row, 9] < nav.LOW_M + 0.5

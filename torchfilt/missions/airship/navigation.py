@@ -49,7 +49,7 @@ _START_S, _FORCE_SD_M_S2, _FIELD_SD_UT = 1.0, 0.5, 5.0
 # The direct filter's guess of the motion: rates and accelerations of a slow ship.
 RATE_SD_RAD_S, RATE_TIME_S, ACCELERATION_SD_M_S2, ACCELERATION_TIME_S = 0.1, 1.0, 0.1, 1.0
 # Modes end and begin here.
-ALIGNED_RAD, LEAST_ALIGNMENT_S = math.radians(3.0), 10.0
+ALIGNED_RAD, LEAST_ALIGNMENT_S = math.radians(5.0), 10.0
 LOW_M, HIGH_M, NEAR_SPOT_M, LEAST_CRUISE_S, LOST_HEIGHT_SD_M = 2.2, 3.2, 4.0, 10.0, 0.3
 _PASS = 0.9999
 
@@ -276,7 +276,7 @@ def _height_lost(now: Situation) -> Tensor:
 
 
 SWITCHES = (
-    Switch(ALIGNMENT, CRUISING, "released from the mast, heading known to 3 deg", _aligned),
+    Switch(ALIGNMENT, CRUISING, "released from the mast, heading known to 5 deg", _aligned),
     Switch(ALIGNMENT, CRUISING, "released from the mast before it was aligned", _released),
     Switch(CRUISING, APPROACHING, "low over the landing spot", _low_over_spot),
     Switch(APPROACHING, CRUISING, "climbed away from the ground", _high),
