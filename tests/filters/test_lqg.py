@@ -271,6 +271,21 @@ def test_it_is_a_module():
     [
         (lambda: LQGController(3, Q), TypeError, "observer must be a filter"),
         (lambda: LQGController(discrete_controller().observer, Q[0]), ValueError, r"gain must be \(k, d\)"),
+        (
+            lambda: LQGController(discrete_controller().observer, double([[1.0] * 3])),
+            ValueError,
+            r"d = 2, got .*\(1, 3\)",
+        ),
+        (
+            lambda: LQGController(discrete_controller().observer, Q.float()),
+            TypeError,
+            "dtype torch.float64, got torch.fl",
+        ),
+        (
+            lambda: LQGController(discrete_controller().observer, [[1.0, 2.0]]),
+            TypeError,
+            "gain must be a tensor .* list",
+        ),
         (lambda: LQGController(discrete_controller().observer, Q / 0), ValueError, "gain must be finite"),
         (lambda: discrete_controller().init((2,), torch.zeros(1)), ValueError, r"control must be \(2, 1\)"),
         (lambda: LQGController.design(PLANT, Q, W, PSD, R, PRIOR, B), ValueError, "a continuous system needs dt"),
@@ -290,6 +305,44 @@ def test_it_is_a_module():
 def test_errors(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+INDEFINITE = double([[4.0, 0.0], [0.0, -0.1]])  # over half a second the whole is positive all the same
+
+
+@pytest.mark.parametrize(
+    ("weights", "error", "message"),
+    [
+        ((INDEFINITE, W), ValueError, "state_weight must be positive semidefinite, its lowest eigenvalue is -0.1"),
+        ((double([[4.0, 1.0], [0.0, 1.0]]), W), ValueError, "state_weight must be symmetric"),
+        ((Q.float(), W), TypeError, "state_weight must have the dtype of a"),
+        ((torch.eye(3, dtype=DOUBLE), W), ValueError, "state_weight must be"),
+        ((Q, 0 * W), ValueError, "control_weight must be positive definite, its lowest eigenvalue is 0"),
+        ((Q, torch.eye(2, dtype=DOUBLE)), ValueError, r"control_weight must be \(\*batch, 1, 1\)"),
+        ((Q, W, W), ValueError, r"cross must be \(\*batch, 2, 1\)"),
+        ((Q, W, double([[5.0], [0.0]])), ValueError, r"\[\[state_weight, cross\].* must be positive semidefinite"),
+    ],
+)
+def test_weights_are_looked_at_before_they_are_sampled(weights, error, message):
+    state, control, *cross = weights
+    with pytest.raises(error, match=message):
+        sampled_weights(PLANT, state, control, PERIOD, *cross)
+    with pytest.raises(error, match=message):
+        LQGController.design(PLANT, state, control, PSD, R_SAMPLED, PRIOR, B, PERIOD, *cross)
+
+
+def test_sampled_weights_of_a_batch_equal_a_loop():
+    a, dt = torch.stack([A, A - torch.eye(2, dtype=DOUBLE)]), double([0.2, 0.7])
+    cross = double([[[0.1], [0.0]], [[0.0], [0.2]]])
+    batch = sampled_weights(ss(a, B, C), Q, W, dt, cross)
+    for row in range(2):
+        system = ss(a[row], B, C).to_control()
+        for whole, one in zip(batch, sampled_weights(system, Q, W, float(dt[row]), cross[row]), strict=True):
+            torch.testing.assert_close(whole[row], one, rtol=1e-13, atol=1e-15)
+    with pytest.raises(ValueError, match=r"this one is discrete with dt = 0\.5"):
+        sampled_weights(DISCRETE, Q, W, PERIOD)
+    with pytest.raises(ValueError, match=r"dt must be positive and finite, .* got -1"):
+        sampled_weights(PLANT, Q, W, -1.0)
 
 
 def test_the_pages_examples_run():

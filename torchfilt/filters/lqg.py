@@ -2,15 +2,14 @@
 
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor, nn
 
 from torchfilt.filters.observer import SteadyStateKalmanFilter
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import check_finite, hold
 from torchfilt.models.control.continuous import linear_model
-from torchfilt.models.control.design import lqr
-from torchfilt.models.control.systems import StateSpace, as_system, c2d, integrate_noise
+from torchfilt.models.control.design import blocks, check_weights, lqr
+from torchfilt.models.control.systems import as_system, c2d, check_period, integrate_noise
 from torchfilt.run import Filter
 from torchfilt.types import FilterState, Step
 
@@ -32,10 +31,10 @@ class LQGController(nn.Module):
         gain: K (k, d), such as of `torchfilt.models.control.lqr`.
 
     Raises:
-        TypeError: the observer is not a filter.
-        ValueError: a gain that is not finite or not a matrix.
+        TypeError: the observer is not a filter, the gain no tensor of the dtype of its model.
+        ValueError: a gain that is not finite, or no matrix that fits the model's state.
 
-    Source: Anderson and Moore, Optimal Control: Linear Quadratic Methods (1990), chapter 8.
+    Source: Anderson and Moore, Optimal Control: Linear Quadratic Methods (1990).
     """
 
     gain: Tensor
@@ -44,8 +43,12 @@ class LQGController(nn.Module):
         super().__init__()
         if not isinstance(observer, Filter):
             raise TypeError(f"observer must be a filter, got {type(observer).__name__}")
-        if gain.dim() != 2:
-            raise ValueError(f"gain must be (k, d), got shape {tuple(gain.shape)}")
+        mean = observer.model.prior().mean
+        if not isinstance(gain, Tensor) or gain.dtype != mean.dtype:
+            got = gain.dtype if isinstance(gain, Tensor) else type(gain).__name__
+            raise TypeError(f"gain must be a tensor of the model's dtype {mean.dtype}, got {got}")
+        if gain.dim() != 2 or gain.shape[-1] != mean.shape[-1]:
+            raise ValueError(f"gain must be (k, d) with d = {mean.shape[-1]}, got shape {tuple(gain.shape)}")
         check_finite(gain, "gain")
         self.observer = observer
         hold(self, "gain", gain)
@@ -122,7 +125,9 @@ class LQGController(nn.Module):
 
 
 class SampledWeights(NamedTuple):
-    """State weight (d, d), control weight (k, k) and cross weight (d, k) of a step, in the order that `lqr` takes."""
+    """State weight (*batch, d, d), control weight (*batch, k, k) and cross weight (*batch, d, k) of a step, in the
+    order that `lqr` takes.
+    """
 
     state: Tensor
     control: Tensor
@@ -130,22 +135,29 @@ class SampledWeights(NamedTuple):
 
 
 def sampled_weights(
-    system: StateSpace, state_weight: Tensor, control_weight: Tensor, dt: float, cross: Tensor | None = None
+    system: Any, state_weight: Tensor, control_weight: Tensor, dt: float | Tensor, cross: Tensor | None = None
 ) -> SampledWeights:
     """The integral of x^T Q x + u^T R u + 2 x^T N u over a step in which u is held, as weights of the sampled system.
 
     Args:
-        system: continuous.
-        state_weight: Q (d, d). control_weight: R (k, k). cross: N (d, k), default zero; per second.
-        dt: s.
+        system: continuous, `StateSpace` or ``control.StateSpace``.
+        state_weight: Q (*batch, d, d). control_weight: R (*batch, k, k). cross: N (*batch, d, k), default zero; per
+            second.
+        dt: s, a number or (*batch).
 
-    Source: Van Loan, IEEE TAC 23 (1978), the integral W; Franklin, Powell, Workman, Digital Control of Dynamic Systems
-        (1998), section 9.3.4.
+    Raises:
+        TypeError, ValueError: weights as in `lqr`; a discrete system; dt as in `c2d`.
+
+    Source: Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23 (1978), the integral W;
+        Franklin, Powell, Workman, Digital Control of Dynamic Systems (1998).
     """
-    a, b = system.a, system.b
-    d, k = b.shape
-    cross = b.new_zeros(d, k) if cross is None else cross
-    whole = torch.cat([torch.cat([a, b], -1), b.new_zeros(k, d + k)])
-    weights = torch.cat([torch.cat([state_weight, cross], -1), torch.cat([cross.mT, control_weight], -1)])
-    held = integrate_noise(whole.mT, weights, dt)
-    return SampledWeights(held[:d, :d], held[d:, d:], held[:d, d:])
+    plant = as_system(system)
+    if plant.is_discrete:
+        raise ValueError(f"costs are sampled of a continuous system, this one is discrete with dt = {plant.dt}")
+    check_period(dt, plant.a)
+    cross = check_weights(plant, state_weight, control_weight, cross)
+    d, k = plant.b.shape[-2:]
+    a, b = plant.a, plant.b
+    whole = blocks([[a, b], [a.new_zeros(k, d), a.new_zeros(k, k)]])
+    weights = integrate_noise(whole.mT, blocks([[state_weight, cross], [cross.mT, control_weight]]), dt)
+    return SampledWeights(weights[..., :d, :d], weights[..., d:, d:], weights[..., :d, d:])

@@ -224,7 +224,7 @@ class SteadyStateKalmanFilter(Filter[Gaussian]):
         ValueError: a batch of systems, an error that is not detectable or not stabilised by noise (the mode is named);
             when run: another dt.
 
-    Source: Anderson and Moore, Optimal Filtering (1979), section 4.4.
+    Source: Anderson and Moore, Optimal Filtering (1979).
     """
 
     carries = Gaussian

@@ -212,8 +212,8 @@ class ContinuousTransition(nn.Module):
         ValueError: steps below 1, a curved space, a density that is not positive semidefinite, shapes that do not fit;
             when called: without dt, a drift or Jacobian of another shape.
 
-    Sources: Jazwinski, Stochastic Processes and Filtering Theory (1970), section 9.3; Särkkä and Solin, Applied
-        Stochastic Differential Equations (2019), section 10.3.
+    Sources: Jazwinski, Stochastic Processes and Filtering Theory (1970); Särkkä and Solin, Applied Stochastic
+        Differential Equations (2019).
     """
 
     def __init__(

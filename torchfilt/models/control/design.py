@@ -192,8 +192,7 @@ def kalman(
             decay and is not seen; an undamped mode that no noise reaches. The eigenvalue is named. As every rank, this
             depends on the scale of the states: what is below 10 d eps of ‖A‖ counts as zero.
 
-    Source: Anderson and Moore, Optimal Filtering, sections 4.4 and 8.3; SciPy's ``solve_continuous_are`` and
-    ``solve_discrete_are``.
+    Source: Anderson and Moore, Optimal Filtering (1979); SciPy's ``solve_continuous_are`` and ``solve_discrete_are``.
     """
     plant = as_system(system)
     noise = state_noise(plant.a, process_noise, noise_input, "process_noise")
@@ -226,21 +225,10 @@ def lqr(system: Any, state_weight: Tensor, control_weight: Tensor, cross: Tensor
             that does not decay and that the input cannot move; an undamped mode that costs nothing. The eigenvalue is
             named.
 
-    Source: Anderson and Moore, Optimal Control: Linear Quadratic Methods, sections 2.4, 3.1 and 3.4; SciPy as in
-    `kalman`.
+    Source: Anderson and Moore, Optimal Control: Linear Quadratic Methods (1990); SciPy as in `kalman`.
     """
     plant = as_system(system)
-    states, controls = plant.b.shape[-2:]
-    state_noise(plant.a, state_weight, None, "state_weight")
-    _check_definite(control_weight, "control_weight", controls, plant.a)
-    if cross is None:
-        cross = plant.a.new_zeros(states, controls)
-    else:
-        check_matrix(cross, "cross", plant.a)
-        if cross.shape[-2:] != (states, controls):
-            raise ValueError(f"cross must be (*batch, {states}, {controls}), got shape {tuple(cross.shape)}")
-        whole = _blocks([[state_weight, cross], [cross.mT, control_weight]])
-        psd_factor(whole, "[[state_weight, cross], [cross^T, control_weight]]")
+    cross = check_weights(plant, state_weight, control_weight, cross)
     eps = torch.finfo(plant.a.dtype).eps
 
     def design(a: Array, b: Array, q: Array, r: Array, n: Array) -> tuple[Array, ...]:
@@ -253,6 +241,25 @@ def lqr(system: Any, state_weight: Tensor, control_weight: Tensor, cross: Tensor
 
     weights = [(state_weight, 2), (control_weight, 2), (cross, 2)]
     return Regulator(*_by_rows(design, plant, [(plant.a, 2), (plant.b, 2), *weights]))
+
+
+def check_weights(plant: StateSpace, state_weight: Tensor, control_weight: Tensor, cross: Tensor | None) -> Tensor:
+    """The cross weight, zeros for None.
+
+    Raises:
+        TypeError, ValueError: as `lqr`, for the weights alone.
+    """
+    states, controls = plant.b.shape[-2:]
+    state_noise(plant.a, state_weight, None, "state_weight")
+    _check_definite(control_weight, "control_weight", controls, plant.a)
+    if cross is None:
+        return plant.a.new_zeros(states, controls)
+    check_matrix(cross, "cross", plant.a)
+    if cross.shape[-2:] != (states, controls):
+        raise ValueError(f"cross must be (*batch, {states}, {controls}), got shape {tuple(cross.shape)}")
+    whole = blocks([[state_weight, cross], [cross.mT, control_weight]])
+    psd_factor(whole, "[[state_weight, cross], [cross^T, control_weight]]")
+    return cross
 
 
 def lqgr(
@@ -281,7 +288,7 @@ def lqgr(
         As `lqr` and `kalman`. ValueError: discrete time with D other than zero, where the control would be needed for
         the measurement that it is computed from.
 
-    Source: Anderson and Moore, Optimal Control, section 8.2 (separation theorem).
+    Source: Anderson and Moore, Optimal Control: Linear Quadratic Methods (1990), the separation theorem.
     """
     plant = as_system(system)
     if plant.is_discrete and plant.d.any():
@@ -295,14 +302,14 @@ def lqgr(
     if plant.is_discrete:
         weight = weight + b.mT @ regulator.cost @ b
         left = torch.eye(a.shape[-1], dtype=a.dtype, device=a.device) - l @ c
-        loop = _blocks([[a - b @ k, b @ k @ left], [0 * a, a @ left]])
-        noise = _blocks([[f, -b @ k @ l], [f, -a @ l]])
-        output = _blocks([[c, 0 * c], [-k, k @ left]])
-        direct = _blocks([[0 * c @ f, 0 * c @ l], [0 * k @ f, -k @ l]])
+        loop = blocks([[a - b @ k, b @ k @ left], [0 * a, a @ left]])
+        noise = blocks([[f, -b @ k @ l], [f, -a @ l]])
+        output = blocks([[c, 0 * c], [-k, k @ left]])
+        direct = blocks([[0 * c @ f, 0 * c @ l], [0 * k @ f, -k @ l]])
     else:
-        loop = _blocks([[a - b @ k, b @ k], [0 * a, a - l @ c]])
-        noise = _blocks([[f, 0 * l], [f, -l]])
-        output = _blocks([[c - d @ k, d @ k], [-k, k]])
+        loop = blocks([[a - b @ k, b @ k], [0 * a, a - l @ c]])
+        noise = blocks([[f, 0 * l], [f, -l]])
+        output = blocks([[c - d @ k, d @ k], [-k, k]])
         direct = 0 * output @ noise
     pushed = (regulator.cost * state_noise(a, process_noise, noise_input, "process_noise")).sum((-2, -1))
     steered = (design.posterior * (k.mT @ weight @ k)).sum((-2, -1))
@@ -413,7 +420,8 @@ def _orth(matrix: Array, tolerance: float) -> Array:
     return left[:, values > tolerance]
 
 
-def _blocks(rows: list[list[Tensor]]) -> Tensor:
+def blocks(rows: list[list[Tensor]]) -> Tensor:
+    """One matrix of many, whose leading dims broadcast."""
     lead = torch.broadcast_shapes(*[block.shape[:-2] for row in rows for block in row])
     wide = [torch.cat([block.expand(*lead, *block.shape[-2:]) for block in row], -1) for row in rows]
     return torch.cat(wide, -2)

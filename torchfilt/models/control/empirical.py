@@ -57,8 +57,8 @@ def empirical_gramian(
         TypeError: dtypes. ValueError: shapes, NaN, a scale or time step out of range, controls and steps that disagree,
             a measurement without noise, a run that leaves what is finite.
 
-    Source: Lall, Marsden and Glavaski, A subspace approach to balanced truncation (2002), definition 6, with unit
-        rotations; Krener and Ide, Measures of unobservability (2009).
+    Source: Lall, Marsden and Glavaski, A subspace approach to balanced truncation (2002), with unit rotations; Krener
+        and Ide, Measures of unobservability (2009).
     """
     space = model.prior().space
     sizes = _check(model, x0, controls, scale)

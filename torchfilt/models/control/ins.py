@@ -57,8 +57,8 @@ def ins_error_pair(
         TypeError: a force that is not a floating-point tensor. ValueError: shapes, NaN, unknown sensors or none, a nose
             that points straight up where the heading is measured.
 
-    Source: Titterton and Weston, Strapdown Inertial Navigation Technology (2004), section 12.3, without Earth's rate
-        and curvature; rows of the heading as in `torchfilt.models.inertial.error_model`.
+    Source: Titterton and Weston, Strapdown Inertial Navigation Technology (2004), without Earth's rate and curvature;
+        rows of the heading as in `torchfilt.models.inertial.error_model`.
     """
     force = specific_force_m_s2
     if not isinstance(force, Tensor) or not force.is_floating_point():

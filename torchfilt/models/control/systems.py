@@ -48,7 +48,7 @@ class StateSpace:
         if states == 0:
             raise ValueError("a must have one state at least, got shape (0, 0)")
         if self.dt is not None:
-            _check_period(self.dt, self.a)
+            check_period(self.dt, self.a)
         try:
             self.batch_shape  # noqa: B018  (computing it is the check)
         except RuntimeError:
@@ -187,8 +187,12 @@ def pzmap(system: Any, axes: Any = None) -> Any:
 
     Returns:
         The matplotlib axes.
+
+    Raises:
+        ValueError: the system is a batch.
     """
     plant = as_system(system)
+    _refuse_batch(plant, "pzmap")
     marks = {"poles": ("x", poles(plant)), "zeros": ("o", zeros(plant))}
     from matplotlib.figure import Figure
 
@@ -242,7 +246,7 @@ def c2d(
     plant = as_system(system)
     if plant.is_discrete:
         raise ValueError(f"c2d needs a continuous system, this one is discrete with dt = {plant.dt}")
-    _check_period(dt, plant.a)
+    check_period(dt, plant.a)
     if noise_psd is None and noise_input is not None:
         raise ValueError("noise_input needs noise_psd beside it")
     covariance = None
@@ -420,7 +424,8 @@ def _period(dt: Any) -> Any:
     return None if dt is None or (not isinstance(dt, Tensor) and dt == 0) else dt
 
 
-def _check_period(dt: float | Tensor, like: Tensor) -> None:
+def check_period(dt: float | Tensor, like: Tensor) -> None:
+    """Refuse what is no positive finite period, a number or a tensor (*batch) of the dtype of ``like``."""
     values = torch.as_tensor(dt, dtype=None if isinstance(dt, Tensor) else like.dtype).detach()
     if isinstance(dt, Tensor) and dt.dtype != like.dtype:
         raise TypeError(f"dt must have the dtype of a, {like.dtype}, got {dt.dtype}")
