@@ -139,6 +139,7 @@ class LinearGaussian(nn.Module):
         if self.control_matrix is not None:
             if u is None:
                 raise ValueError("this law has a control_matrix but no control u was given")
+            check_control(u, self.control_matrix)
             push = u @ self.control_matrix.mT
             offset = push if offset is None else for_points(offset, 1, push.dim() - 1) + push
         return LinearForm(self.matrix, offset, self.noise())
@@ -272,6 +273,12 @@ def one_number(value: Tensor | float, name: str, *, zero: bool = False, dtype: t
         rule = "finite number >= 0" if zero else "positive finite number"
         raise ValueError(f"{name} must be one {rule}, got {value}")
     return number
+
+
+def check_control(u: Tensor, matrix: Tensor) -> None:
+    """Raise a ValueError where a control (..., k) does not fit its input matrix (..., d, k)."""
+    if u.shape[-1:] != matrix.shape[-1:]:
+        raise ValueError(f"the control must be (*batch, {matrix.shape[-1]}), got shape {tuple(u.shape)}")
 
 
 def check_finite(tensor: Tensor, name: str) -> None:

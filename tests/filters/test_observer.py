@@ -479,6 +479,8 @@ STATIC = ss(0.5 * ONE, B, C, dt=0.5)
         (lambda: LuenbergerObserver(3, GAIN), TypeError, "StateSpace"),
         (lambda: LuenbergerObserver(PLANT, GAIN.mT), ValueError, r"gain must be \(2, 1\)"),
         (lambda: LuenbergerObserver(PLANT, GAIN / 0), ValueError, "gain must be finite"),
+        (lambda: LuenbergerObserver(PLANT, GAIN.tolist()), TypeError, r"gain must be a tensor \(d, m\), got list"),
+        (lambda: LuenbergerObserver(PLANT, GAIN, normal(3)), ValueError, r"initial must be .* got shape \(3,\)"),
         (lambda: LuenbergerObserver(PLANT, GAIN.float()), TypeError, "gain must have the system's dtype"),
         (lambda: LuenbergerObserver(ss(A.expand(3, 2, 2), B, C), GAIN), ValueError, "one system for all rows"),
         (lambda: LuenbergerObserver(PLANT, GAIN, PRIOR, ONE), ValueError, "given together"),
@@ -529,6 +531,19 @@ STATIC = ss(0.5 * ONE, B, C, dt=0.5)
 def test_errors(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+@pytest.mark.parametrize("plant", [PLANT, ss(0.5 * ONE, B, C, dt=PERIOD)])
+@pytest.mark.parametrize("kind", ["Luenberger", "stationary", "recursive"])
+def test_controls_of_another_size_are_refused(plant, kind):
+    model = linear_model(plant, ONE, R, PRIOR)
+    filters = {
+        "Luenberger": lambda: LuenbergerObserver(plant, GAIN),
+        "stationary": lambda: SteadyStateKalmanFilter(model, PERIOD),
+        "recursive": lambda: tf.KalmanFilter(model),
+    }
+    with pytest.raises(ValueError, match=r"the control must be \(\*batch, 1\), got shape \(2,\)"):
+        filters[kind]()(normal(3, 1), normal(3, 2), PERIOD)
 
 
 def test_controls_that_no_law_looks_at_are_refused():

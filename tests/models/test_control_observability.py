@@ -656,6 +656,7 @@ NAN = torch.full((1, 3), math.nan, dtype=DOUBLE)
         (lambda: obsv(A, C, time_scale=0.0), ValueError, "time_scale must be positive and finite, got 0.0"),
         (lambda: rank(A.tolist()), TypeError, "matrix must be a floating-point tensor, got list"),
         (lambda: rank(A[0]), ValueError, r"matrix must be \(\*batch, m, n\), got shape \(3,\)"),
+        (lambda: rank(A[:0]), ValueError, r"matrix must be \(\*batch, m, n\), got shape \(0, 3\)"),
         (lambda: rank(NAN), ValueError, "matrix must be finite"),
         (lambda: rank(A, -1.0), ValueError, "tolerance must be finite and not negative, got -1.0"),
         (lambda: rank(A, scale="rows"), ValueError, "scale must be sizes of the states or 'columns', got 'rows'"),

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
-from torchfilt.laws import check_finite, row_steps
+from torchfilt.laws import check_control, check_finite, row_steps
 from torchfilt.linalg import apply_factor, log_abs_diagonal, psd_factor, triangularize, whiten
 from torchfilt.models.control.continuous import ContinuousLinear, linear_model
 from torchfilt.models.control.design import kalman
@@ -45,9 +45,10 @@ class LuenbergerObserver(Filter[Gaussian]):
         noise_input: F (d, w); None: the identity.
 
     Raises:
-        TypeError: dtypes that differ.
-        ValueError: a batch of systems, a gain of another shape or not finite, one noise without the other, noise
-            without a prior that is a Gaussian; when run: a dt that is not the system's, a continuous system without dt.
+        TypeError: dtypes that differ, a gain that is no tensor.
+        ValueError: a batch of systems, a gain or prior of another shape, a gain that is not finite, one noise without
+            the other, noise without a prior that is a Gaussian; when run: a control of another size, a dt that is not
+            the system's, a continuous system without dt.
 
     Source: Luenberger, An introduction to observers, IEEE TAC 16 (1971).
     """
@@ -153,6 +154,7 @@ class LuenbergerObserver(Filter[Gaussian]):
         """See `Filter.advance`; noise is not used."""
         _check_measured(y, self.c)
         u = self.b.new_zeros(self.b.shape[-1]) if u is None else u
+        check_control(u, self.b)
         observed = _observed(y, missing)
         gain = self.gain if observed is None else self.gain * observed.to(y.dtype).unsqueeze(-2)
         if self.dt is None:
@@ -315,6 +317,7 @@ class SteadyStateKalmanFilter(Filter[Gaussian]):
         if push is not None:
             if u is None:
                 raise ValueError(f"the {name} has an input matrix but no control u was given")
+            check_control(u, push)
             rest: Tensor = getattr(self, f"{name}_rest")
             return rest + u @ push.mT
         offset = getattr(self.model, name).linear_form(u if self._hears(name) else None, self.dt).offset
@@ -420,6 +423,8 @@ def _check_gain(plant: StateSpace, gain: Tensor) -> None:
     """One finite gain for one system."""
     if plant.batch_shape:
         raise ValueError(f"an observer needs one system for all rows, got a batch {tuple(plant.batch_shape)}")
+    if not isinstance(gain, Tensor):
+        raise TypeError(f"gain must be a tensor (d, m), got {type(gain).__name__}")
     if gain.shape != (len(plant.a), len(plant.c)):
         raise ValueError(f"gain must be ({len(plant.a)}, {len(plant.c)}) = (d, m), got {tuple(gain.shape)}")
     check_finite(gain, "gain")
@@ -432,4 +437,6 @@ def _prior(initial: Gaussian | Tensor | None, like: Tensor) -> Gaussian:
     if isinstance(initial, Gaussian):
         return initial
     mean = like.new_zeros(len(like)) if initial is None else initial
+    if mean.shape[-1:] != like.shape[-1:]:
+        raise ValueError(f"initial must be a mean (*batch, {len(like)}), got shape {tuple(mean.shape)}")
     return Gaussian(mean, like.new_zeros(len(like)), is_diagonal=True)

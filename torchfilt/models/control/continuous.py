@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.laws import LinearForm, LinearGaussian, call_style, check_finite, hold, row_steps
+from torchfilt.laws import LinearForm, LinearGaussian, call_style, check_control, check_finite, hold, row_steps
 from torchfilt.linalg import apply_factor, for_points, is_differentiated, psd_factor, triangularize
 from torchfilt.model import StateSpaceModel
 from torchfilt.models.control.systems import as_system, hold_input, noise_factor, state_noise
@@ -171,6 +171,7 @@ class ContinuousLinear(nn.Module):
             return LinearForm(transition, None, factor)
         if u is None:
             raise ValueError("this law has an input matrix b but no control u was given")
+        check_control(u, push)
         if push.dim() == 2:
             return LinearForm(transition, u @ push.mT, factor)
         return LinearForm(transition, apply_factor(push, u.expand(*push.shape[:-2], u.shape[-1])), factor)

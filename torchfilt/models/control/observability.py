@@ -23,6 +23,8 @@ def obsv(a: Any, c: Tensor | None = None, *, time_scale: float = 1.0) -> Tensor:
 
     The state that is looked for changes at most one of these rows where it is seen at all. In seconds the higher powers
     of slow systems vanish beside the lower ones; with s as long as the observation they compare as they do in the data.
+    Where a s is much larger than one, the higher powers drown the lower ones instead: take s no longer than the fastest
+    mode lasts.
 
     Args:
         a: (*batch, d, d), or a system with both matrices (`StateSpace`, `control.StateSpace`).
@@ -103,7 +105,7 @@ def scale_columns(matrix: Tensor, scale: Scale) -> Tensor:
         raise TypeError(
             f"matrix must be a floating-point tensor, got {getattr(matrix, 'dtype', type(matrix).__name__)}"
         )
-    if matrix.dim() < 2:
+    if matrix.dim() < 2 or 0 in matrix.shape[-2:]:
         raise ValueError(f"matrix must be (*batch, m, n), got shape {tuple(matrix.shape)}")
     check_finite(matrix, "matrix")
     if scale is None:
