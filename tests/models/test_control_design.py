@@ -309,6 +309,43 @@ def test_a_mode_that_is_not_seen_is_named(dt):
     assert str(caught.value).count("j") == 2
 
 
+@pytest.mark.parametrize("dt", [None, 1.0])
+@pytest.mark.parametrize("seed", range(12))
+def test_a_hidden_mode_is_named_in_any_coordinates(dt, seed):
+    """Up to seven growing modes; rounding of the hidden one must not be taken for something seen."""
+    rng = np.random.default_rng(seed)
+    d = int(rng.integers(4, 8))
+    modes = np.sort(rng.uniform(1.2, 3.0, d))
+    basis, hidden = rng.normal(size=(d, d)), int(rng.integers(d))
+    row = rng.normal(size=(1, d)) * (np.arange(d) != hidden)
+    a = torch.tensor(basis @ np.diag(modes) @ np.linalg.inv(basis))
+    c = torch.tensor(row @ np.linalg.inv(basis))
+    one, weight = torch.eye(d, dtype=DOUBLE), tensor([[1.0]])
+    calls = [
+        lambda: kalman(ss(a, torch.zeros(d, 0, dtype=DOUBLE), c, dt=dt), one, weight),
+        lambda: lqr(ss(a.mT, c.mT, dt=dt), one, weight),
+        lambda: place(a.mT, c.mT, -np.arange(1.0, d + 1)),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match=r"(do not see|does not move|cannot move) the mode [0-9.]+[ ,]") as caught:
+            call()
+        named = float(str(caught.value).split("the mode ")[1].split()[0].rstrip(","))
+        assert abs(named - modes[hidden]) < 1e-5
+
+
+@pytest.mark.parametrize(("dt", "first"), [(None, 100.0), (1.0, 30.0)])
+def test_a_solution_that_does_not_stabilize_is_refused(dt, first):
+    """Five growing modes, near to each other, with one input: the feedback is beyond sixteen digits."""
+    system = ss(torch.diag(first + torch.arange(5.0, dtype=DOUBLE)), torch.ones(5, 1, dtype=DOUBLE), dt=dt)
+    one, weight = torch.eye(5, dtype=DOUBLE), tensor([[1.0]])
+    # Which of the two is found first is a matter of rounding in SciPy.
+    message = r"the Riccati equation (is too sensitive .* the mode [0-9.]+ does not decay|has no stabilizing solution)"
+    with pytest.raises(ValueError, match=message):
+        lqr(system, one, weight)
+    with pytest.raises(ValueError, match=message):
+        kalman(ss(system.a, system.b, system.b.mT, dt=dt), one, weight)
+
+
 @pytest.mark.parametrize("dt", [None, 0.1])
 def test_an_undamped_mode_that_no_noise_reaches_is_named(dt):
     a, basis = oscillators()

@@ -190,7 +190,8 @@ def kalman(
         TypeError: a dtype other than the system's.
         ValueError: Q not positive semidefinite, R not positive definite, shapes that do not fit; a mode that does not
             decay and is not seen; an undamped mode that no noise reaches. The eigenvalue is named. As every rank, this
-            depends on the scale of the states: what is below 10 d eps of ‖A‖ counts as zero.
+            depends on the scale of the states: what is below 10 d eps of ‖A‖ counts as zero. An equation that is too
+            sensitive to be solved in float64, so that a mode of the error would not decay.
 
     Source: Anderson and Moore, Optimal Filtering (1979); SciPy's ``solve_continuous_are`` and ``solve_discrete_are``.
     """
@@ -223,7 +224,7 @@ def lqr(system: Any, state_weight: Tensor, control_weight: Tensor, cross: Tensor
         TypeError: a dtype other than the system's.
         ValueError: R not positive definite, [[Q, N], [Nᵀ, R]] not positive semidefinite, shapes that do not fit; a mode
             that does not decay and that the input cannot move; an undamped mode that costs nothing. The eigenvalue is
-            named.
+            named. An equation that is too sensitive, as in `kalman`.
 
     Source: Anderson and Moore, Optimal Control: Linear Quadratic Methods (1990); SciPy as in `kalman`.
     """
@@ -233,10 +234,7 @@ def lqr(system: Any, state_weight: Tensor, control_weight: Tensor, cross: Tensor
 
     def design(a: Array, b: Array, q: Array, r: Array, n: Array) -> tuple[Array, ...]:
         cost = _riccati(a, b, q, r, n, plant.is_discrete, eps, _CONTROL)
-        if plant.is_discrete:
-            gain = np.linalg.solve(r + b.T @ cost @ b, b.T @ cost @ a + n.T)
-        else:
-            gain = np.linalg.solve(r, b.T @ cost + n.T)
+        gain = _feedback(a, b, r, n, cost, plant.is_discrete)
         return gain, cost, np.linalg.eigvals(a - b @ gain).astype(complex)
 
     weights = [(state_weight, 2), (control_weight, 2), (cross, 2)]
@@ -334,7 +332,25 @@ def _riccati(a: Array, b: Array, q: Array, r: Array, n: Array, is_discrete: bool
         solution = solve(a, b * unit, q, unit[:, None] * r * unit, s=n * unit)
     except LinAlgError as error:
         raise ValueError(f"the Riccati equation has no stabilizing solution to be found: {error}") from None
-    return (solution + solution.T) / 2
+    solution = (solution + solution.T) / 2
+    gain = _feedback(a, b, r, n, solution, is_discrete)
+    loop = a - b @ gain
+    poles = _modes(loop)
+    growth, doubt = _growth(poles, loop, is_discrete, eps)
+    if (growth > doubt).any():
+        raise ValueError(
+            f"the Riccati equation is too sensitive to be solved in float64: with the solution that is found the mode "
+            f"{_number(poles.values[(growth - doubt).argmax()])} does not decay"
+        )
+    return solution
+
+
+def _feedback(a: Array, b: Array, r: Array, n: Array, cost: Array, is_discrete: bool) -> Array:
+    """The best gain K (k, d), given the cost to go."""
+    if is_discrete:
+        gain: Array = np.linalg.solve(r + b.T @ cost @ b, b.T @ cost @ a + n.T)
+        return gain
+    return np.linalg.solve(r, b.T @ cost + n.T)
 
 
 class _Modes(NamedTuple):
@@ -347,20 +363,35 @@ class _Modes(NamedTuple):
 def _split(a: Array, b: Array, eps: float) -> tuple[Array, _Modes]:
     """Orthonormal basis (d, r) of the states that inputs reach, and the modes of the rest, which they cannot move.
 
-    Where these are, [A - s I, B] loses rank. The staircase is used rather than that rank, which is blind for multiple
-    eigenvalues: they are known to the root of the precision only.
+    Where these are, [A - s I, B] loses rank. That alone is blind for multiple eigenvalues, which are known to the root
+    of the precision only; the staircase alone takes the rounding of a mode out of reach, which grows from step to step,
+    for a state in reach. So modes that the rank tells are taken out first, and the staircase finds the others.
     """
-    states = len(a)
     directions = _unit_columns(b)
-    basis, fresh = np.zeros((states, 0)), _orth(directions, _tolerance(directions, eps))
+    kept = _complement(_unmoved(a, directions, eps))
+    part = kept.T @ a @ kept
+    inner, fresh = np.zeros((len(part), 0)), _orth(kept.T @ directions, _tolerance(directions, eps))
     while fresh.shape[1]:
-        basis = np.hstack([basis, fresh])
-        fresh = a @ fresh
+        inner = np.hstack([inner, fresh])
+        fresh = part @ fresh
         for _ in range(2):  # the second time takes away what rounding left
-            fresh = fresh - basis @ (basis.T @ fresh)
+            fresh = fresh - inner @ (inner.T @ fresh)
         fresh = _orth(fresh, _tolerance(a, eps))
-    rest = np.linalg.svd(basis)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(states)
+    basis = kept @ inner
+    rest = _complement(basis)
     return basis, _modes(rest.T @ a @ rest)
+
+
+def _unmoved(a: Array, directions: Array, eps: float) -> Array:
+    """Orthonormal basis (d, u) of what [A - s I, B] leaves out at the eigenvalues s of A, real and imaginary parts."""
+    states = len(a)
+    size = float(np.linalg.norm(a, 2)) or 1.0
+    found = []
+    for value in np.linalg.eigvals(a):
+        left, values, _ = np.linalg.svd(np.hstack([a - value * np.eye(states), size * directions]))
+        out = left[:, values <= 10 * states * eps * size]
+        found += [out.real, out.imag]
+    return _orth(np.hstack(found), np.sqrt(eps))
 
 
 def _modes(a: Array) -> _Modes:
@@ -418,6 +449,11 @@ def _orth(matrix: Array, tolerance: float) -> Array:
     """Orthonormal basis of the range."""
     left, values, _ = np.linalg.svd(matrix, full_matrices=False)
     return left[:, values > tolerance]
+
+
+def _complement(basis: Array) -> Array:
+    """Orthonormal basis (d, d - r) of what is orthogonal to that of a basis (d, r)."""
+    return np.linalg.svd(basis)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(len(basis))
 
 
 def blocks(rows: list[list[Tensor]]) -> Tensor:
