@@ -9,7 +9,7 @@ import run_airship
 import torch
 from scipy.stats import chi2
 
-from torchfilt.missions.airship import navigation, study
+from torchfilt.missions.airship import figures, navigation, study
 from torchfilt.missions.airship.scene import AirshipSettings, make_scene
 
 SHORT = AirshipSettings(runs=2, anchored_s=12.0, cruise_s=14.0, approach_s=6.0)
@@ -44,6 +44,25 @@ def test_a_short_mission(outcome):
     assert drawn == {"mission.png", "errors.png", "modes.png", "compare.png"}
 
 
+@pytest.mark.parametrize(
+    ("name", "shown"), [("indirect", ["alignment", "cruise"]), ("indirect-no-modes", ["without modes"])]
+)
+def test_the_path_is_drawn_with_and_without_modes(outcome, tmp_path, monkeypatch, name, shown):
+    folder, _, _ = outcome
+    stored = next((folder / "stages").glob(f"{name}-????????????.npz"))
+    with np.load(stored) as file:
+        result = dict(file)
+    scene, seen = make_scene(SHORT), {}
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: seen.setdefault(path.name, figure))
+    figures.airship_figures({name: result}, scene, tmp_path)
+    above, side = seen["mission.png"].axes
+    labels = [line.get_label() for line in above.lines]
+    assert labels[: 1 + len(shown)] == ["truth", *shown] and len(side.lines) == 1 + len(shown)
+    # Together the pieces are the estimate: truth less error.
+    pieces = np.nansum([line.get_ydata() for line in side.lines[1:]], 0)
+    np.testing.assert_allclose(pieces, scene.truth[:, 0, 9].numpy() - result["error"][:, 0, 8], rtol=1e-12)
+
+
 def test_finished_stages_are_kept(outcome):
     folder, summary, _ = outcome
     said = []
@@ -76,7 +95,7 @@ def made_up(scene):
 def test_numbers_of_made_up_errors():
     scene = make_scene(AirshipSettings(runs=2, anchored_s=12.0, cruise_s=6.0, approach_s=6.0))
     result = made_up(scene)
-    result["accepted"][10, 0, 1] = False
+    result["accepted"][11, 0, 1] = result["accepted"][19, 1, 3] = False
     result["ok"][5, 1] = False
     found = study.summarize(result, scene, "indirect")
     for phase in study.PHASES:
@@ -87,7 +106,8 @@ def test_numbers_of_made_up_errors():
     assert found["cruise"]["height_m"] == pytest.approx(0.2) and found["landing_height_m"] == pytest.approx(0.05)
     assert found["aligned_s"] == pytest.approx(2.0) and found["refiltered"] == 7 and found["failed"] == 1
     assert found["switches"]["released from the mast before it was aligned"] == 1
-    assert found["refused"]["barometer"] == pytest.approx(1 / result["accepted"][..., 1].size)
+    # Of 480 steps in two runs each second one has a barometer, each tenth one beacons; the sonar comes late.
+    assert found["refused"] == {"barometer": 1 / 480, "magnetometer": 0, "beacons": 1 / 96}
     assert found["ms_per_step"] == pytest.approx(2.0)
     assert study.log_lines(result, scene, "indirect") == [
         "run 0,  15.05 s: alignment -> cruise: released from the mast before it was aligned"

@@ -19,7 +19,7 @@ from torchfilt.missions.airship.navigation import (
     make_filter,
     readings,
 )
-from torchfilt.missions.airship.scene import AirshipSettings, Scene, make_scene
+from torchfilt.missions.airship.scene import FILTER_RATE_HZ, AirshipSettings, Scene, make_scene
 from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
 from torchfilt.models.landing import LANDING_SPACE
 from torchfilt.modes import NavigationModes
@@ -110,8 +110,8 @@ def summarize(result: Arrays, scene: Scene, name: str) -> dict[str, Any]:
         By phase of the mission: rms over runs and time of each group of `GROUPS`, and nees, its mean per degree of
         freedom over runs and time. landing_height_m: rms of the height over the last second. aligned_s: median time
         from which the heading stays within 3 deg while the ship is moored. switches: by reason, in how many runs.
-        refused: by sensor, share of measurements in time. failed: runs with any failed step. refiltered; ms_per_step:
-        CPU, all runs.
+        refused: by sensor that is given in time, share of its readings. failed: runs with any failed step. refiltered;
+        ms_per_step: CPU, all runs.
     """
     error, phase = result["error"], scene.phase.numpy()
     summary: dict[str, Any] = {}
@@ -127,8 +127,11 @@ def summarize(result: Arrays, scene: Scene, name: str) -> dict[str, Any]:
     ways = filter.switches if isinstance(filter, NavigationModes) else ()
     summary["switches"] = {way.reason: int((result["switch"] == k).any(0).sum()) for k, way in enumerate(ways)}
     law: Any = filter.model.observation
+    given = {sensor: (~torch.isnan(y)).any(-1).sum().item() for sensor, y in readings(scene, VARIANTS[name]).items()}
     summary["refused"] = {
-        sensor: float(1 - result["accepted"][..., k].mean()) for k, sensor in enumerate(law.names) if sensor != "mast"
+        sensor: float((~result["accepted"][..., k]).sum() / given[sensor])
+        for k, sensor in enumerate(law.names)
+        if sensor != "mast" and given[sensor]
     }
     summary["failed"] = int((~result["ok"]).any(0).sum())
     summary["refiltered"] = int(result["refiltered"])
@@ -193,7 +196,7 @@ def run_airship(
     names = DEFAULT if filters is None else tuple(filters)
     check_names(names, FILTERS, "filters")
     stages = Stages(Path(out) / "stages", say)
-    say(f"{settings.runs} missions of {settings.steps / 20:g} s: {', '.join(PHASES)}")
+    say(f"{settings.runs} missions of {settings.steps / FILTER_RATE_HZ:g} s: {', '.join(PHASES)}")
     scene = make_scene(settings)
     results: dict[str, Arrays] = {}
     found: dict[str, Any] = {}
