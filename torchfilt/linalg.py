@@ -5,6 +5,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 
+def is_traced() -> bool:
+    """Whether the code runs under torch.compile or a transform of torch.func, where no branch may ask for numbers."""
+    return torch.compiler.is_compiling() or bool(torch._C._are_functorch_transforms_active())
+
+
 def is_differentiated(*tensors: Tensor) -> bool:
     """Whether a derivative is taken with respect to any of the tensors, in reverse or in forward mode."""
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):

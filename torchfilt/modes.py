@@ -10,6 +10,7 @@ from torch import Tensor
 from torchfilt.filters.gaussian import GaussianFilter
 from torchfilt.gaussian import Gaussian
 from torchfilt.history import History
+from torchfilt.linalg import is_traced
 from torchfilt.particles import Particles
 from torchfilt.run import Filter
 from torchfilt.sensors import Sensors
@@ -152,7 +153,7 @@ class NavigationModes(Filter[Moded]):
     ) -> tuple[Any, StepInfo]:
         """Each filter that a row needs, and of its answers the rows that asked."""
         found: tuple[Any, StepInfo] | None = None
-        traced = torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+        traced = is_traced()
         for one, modes in zip(self.filters, self._runs, strict=True):
             rows = None
             if len(self.filters) > 1:

@@ -523,7 +523,7 @@ STATIC = ss(0.5 * ONE, B, C, dt=0.5)
                 tf.StateSpaceModel(PRIOR, tf.LinearGaussian(2 * ONE, ONE), tf.LinearGaussian(C, R))
             ),
             ValueError,
-            "2",
+            "do not see the mode 2, which does not decay",
         ),
         (lambda: linear_model(PLANT, ONE, -R, PRIOR), ValueError, "positive semidefinite"),
     ],

@@ -671,6 +671,13 @@ NAN = torch.full((1, 3), math.nan, dtype=DOUBLE)
             ValueError,
             "positive whole number of steps, got 1.5",
         ),
+        (lambda: pbh(ss(A, C.mT, C), discrete=True), ValueError, "this system is continuous, its dt is None"),
+        (
+            lambda: observability_gramian(ss(A, C.mT, C), None, 1.0, discrete=True),
+            ValueError,
+            "this system is continuous",
+        ),
+        (lambda: controllability_gramian(ss(A, C.mT, C), None, 1.0, discrete=True), ValueError, "this system is cont"),
         (lambda: pbh(A, C, tolerance=math.nan), ValueError, "tolerance must be finite and not negative, got nan"),
         (lambda: stripped_observability([]), ValueError, r"pieces must be at least one pair .* got sizes \[\]"),
         (lambda: stripped_observability([(A, C), (A[:2, :2], C[:, :2])]), ValueError, r"one state size, .*\[3, 2\]"),

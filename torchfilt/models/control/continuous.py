@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
 from torchfilt.laws import LinearForm, LinearGaussian, call_style, check_control, check_finite, hold, row_steps
-from torchfilt.linalg import apply_factor, for_points, is_differentiated, psd_factor, triangularize
+from torchfilt.linalg import apply_factor, for_points, is_differentiated, is_traced, psd_factor, triangularize
 from torchfilt.model import StateSpaceModel
 from torchfilt.models.control.systems import as_system, hold_input, noise_factor, state_noise
 from torchfilt.models.ode import rk4
@@ -76,7 +76,7 @@ def _needs_step(dt: Step) -> Tensor | float:
 
 def _may_hold(parts: list[Tensor]) -> bool:
     """Whether matrices made of these tensors can be kept beyond the call."""
-    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active() or is_differentiated(*parts):
+    if is_traced() or is_differentiated(*parts):
         return False
     return not torch.is_inference_mode_enabled() and not any(part.is_inference() for part in parts)
 

@@ -144,7 +144,7 @@ def observability_gramian(
         a: (*batch, d, d), or a system, whose dt says whether it is discrete. c: (*batch, m, d); whiten it by the noise,
             and W is the information in the measurements.
         horizon: seconds, or a whole number of steps; None for ever, by the Lyapunov equation (SciPy; no gradients).
-        discrete: whether (a, c) is a discrete pair.
+        discrete: whether (a, c) is a discrete pair; an error beside a continuous system.
 
     Returns:
         (*batch, d, d), symmetric.
@@ -155,7 +155,7 @@ def observability_gramian(
 
     Source: Van Loan, Computing integrals involving the matrix exponential (1978), theorem 1.
     """
-    discrete = discrete if c is not None else as_system(a).dt is not None
+    discrete = _in_steps(a, c, discrete)
     a, c = check_pair(a, c, "c")
     weight = c.mT @ c
     if horizon is None:
@@ -180,7 +180,7 @@ def controllability_gramian(
     Raises:
         As `observability_gramian`.
     """
-    discrete = discrete if b is not None else as_system(a).dt is not None
+    discrete = _in_steps(a, b, discrete)
     a, b = check_pair(a, b, "b")
     return observability_gramian(a.mT, b.mT, horizon, discrete=discrete)
 
@@ -255,7 +255,7 @@ def pbh(a: Any, c: Tensor | None = None, *, discrete: bool = False, tolerance: f
 
     Args:
         a: (*batch, d, d), or a system, whose dt says whether it is discrete. c: (*batch, m, d).
-        discrete: whether (a, c) is a discrete pair.
+        discrete: whether (a, c) is a discrete pair; an error beside a continuous system.
         tolerance: default sqrt(eps) times the norm of [a; c]: far above d * eps, because rounding moves a k-fold
             eigenvalue by as much as the k-th root of eps, and a mode is tested at its computed eigenvalue.
 
@@ -264,7 +264,7 @@ def pbh(a: Any, c: Tensor | None = None, *, discrete: bool = False, tolerance: f
 
     Source: Hautus, Controllability and observability conditions of linear autonomous systems (1969).
     """
-    discrete = discrete if c is not None else as_system(a).dt is not None
+    discrete = _in_steps(a, c, discrete)
     a, c = check_pair(a, c, "c")
     size, lead = a.shape[-1], torch.broadcast_shapes(a.shape[:-2], c.shape[:-2])
     a, c = a.expand(*lead, size, size), c.expand(*lead, *c.shape[-2:])
@@ -283,6 +283,16 @@ def pbh(a: Any, c: Tensor | None = None, *, discrete: bool = False, tolerance: f
 
 
 # Arguments ------------------------------------------------------------------------------------------------------------
+
+
+def _in_steps(a: Any, other: Tensor | None, discrete: bool) -> bool:
+    """Whether time goes in steps: as it is said of a pair, by the period of a system."""
+    if other is not None:
+        return discrete
+    system = as_system(a)
+    if discrete and not system.is_discrete:
+        raise ValueError("discrete=True is said of a pair of matrices; this system is continuous, its dt is None")
+    return system.is_discrete
 
 
 def check_pair(a: Any, other: Tensor | None, name: Literal["b", "c"]) -> Pair:

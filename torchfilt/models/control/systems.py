@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchfilt.linalg import matrix_exp, psd_factor, triangularize
+from torchfilt.linalg import is_traced, matrix_exp, psd_factor, triangularize
 
 Array = NDArray[np.float64]
 
@@ -376,7 +376,7 @@ class _ShortStep(NamedTuple):
 def _short_step(a: Tensor, dt: float | Tensor) -> _ShortStep:
     period = _column(dt, a)
     doublings = torch.log2((_size(a) * period).detach()).ceil().clamp_min(0)
-    traced = torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+    traced = is_traced()
     limit = _TRACED_DOUBLINGS if traced else _DOUBLINGS
     most = limit if traced else int(doublings.nan_to_num(0).clamp_max(limit).max().item())
     step = (period * torch.exp2(-doublings)).masked_fill(doublings > limit, torch.nan).unsqueeze(-3)
