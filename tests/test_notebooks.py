@@ -47,6 +47,18 @@ def test_the_example_on_modes_prints_what_the_page_says(capsys: pytest.CaptureFi
     assert abs(float(history.mean[-1, 1, 0] - truth[-1, 1])) < 1.0
 
 
+def test_the_examples_on_sensors_print_what_the_page_says(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "docs" / "sensors.md").read_text()
+    blocks = re.findall(r"```(?:python)?\n(.*?)```", text, flags=re.DOTALL)
+    for example, printed in zip(blocks[::2], blocks[1::2], strict=True):
+        names: dict[str, Any] = {}
+        exec(compile(example, "docs/sensors.md", "exec"), names)
+        assert capsys.readouterr().out == printed
+        if "found" in names and "truth" in names:  # a descent
+            off = (names["found"] - names["truth"])[[9, 17]].abs()
+            assert (off < 4 * names["sd"][[8, 16]]).all() and off[0] < 0.05
+
+
 def test_the_examples_on_orientations_run_and_agree() -> None:
     """One block after the other; every filter that they make goes on with the measurements of the first."""
     text = (ROOT / "docs" / "attitude_filters.md").read_text()
