@@ -103,12 +103,14 @@ def psd_factor(covariance: Tensor, name: str = "covariance") -> Tensor:
         name: how the caller calls the matrix, for the error.
 
     Raises:
+        TypeError: not a floating-point tensor.
         ValueError: not square, not finite, not symmetric or with a negative eigenvalue; the value is named.
     """
+    if not isinstance(covariance, Tensor) or not covariance.is_floating_point():
+        got = covariance.dtype if isinstance(covariance, Tensor) else type(covariance).__name__
+        raise TypeError(f"{name} must be a floating-point tensor, got {got}")
     if covariance.dim() < 2 or covariance.shape[-1] != covariance.shape[-2]:
         raise ValueError(f"{name} must be a square matrix (*batch, e, e), got shape {tuple(covariance.shape)}")
-    if not covariance.is_floating_point():
-        raise TypeError(f"{name} must be a floating-point tensor, got {covariance.dtype}")
     values = covariance.detach()
     finite = torch.isfinite(values)
     if not finite.all():

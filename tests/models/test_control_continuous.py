@@ -451,6 +451,13 @@ ONE = torch.eye(2, dtype=DOUBLE)
     ("make", "error", "message"),
     [
         (lambda: ContinuousLinear(normal(2, 3), ONE), ValueError, "a must be a square matrix"),
+        (lambda: ContinuousLinear([[1.0]], ONE), TypeError, "a must be a floating-point tensor, got list"),
+        (lambda: ContinuousLinear(ONE, [[1.0]]), TypeError, "noise_psd must be a floating-point tensor, got list"),
+        (
+            lambda: ContinuousTransition(pendulum, [[1.0]]),
+            TypeError,
+            "noise_psd must be a floating-point tensor, got l",
+        ),
         (lambda: ContinuousLinear(ONE * torch.nan, ONE), ValueError, "a must be finite"),
         (lambda: ContinuousLinear(ONE, -ONE), ValueError, "noise_psd must be positive semidefinite"),
         (lambda: ContinuousLinear(ONE, double([[1.0]])), ValueError, "noise_psd must be 2 x 2"),

@@ -14,7 +14,7 @@ from torchfilt.gaussian import Gaussian
 from torchfilt.laws import LinearForm, LinearGaussian, call_style, check_control, check_finite, hold, row_steps
 from torchfilt.linalg import apply_factor, for_points, is_differentiated, is_traced, psd_factor, triangularize
 from torchfilt.model import StateSpaceModel
-from torchfilt.models.control.systems import as_system, hold_input, noise_factor, state_noise
+from torchfilt.models.control.systems import as_system, check_matrix, hold_input, noise_factor, state_noise
 from torchfilt.models.ode import rk4
 from torchfilt.spaces import EUCLIDEAN, Space, curved_components
 
@@ -96,7 +96,7 @@ class ContinuousLinear(nn.Module):
         b: B (*batch, d, k) or None.
 
     Raises:
-        TypeError: dtypes that differ.
+        TypeError: what is no floating-point tensor, dtypes that differ.
         ValueError: shapes that do not fit, numbers that are not finite, a density that is not positive semidefinite;
             when called: without dt, or u without b.
 
@@ -110,17 +110,14 @@ class ContinuousLinear(nn.Module):
         self, a: Tensor, noise_psd: Tensor, noise_input: Tensor | None = None, b: Tensor | None = None
     ) -> None:
         super().__init__()
-        if a.dim() < 2 or a.shape[-1] != a.shape[-2]:
+        for name, matrix in (("a", a), ("noise_psd", noise_psd), ("b", b)):
+            if matrix is not None:
+                check_matrix(matrix, name, a)
+        if a.shape[-1] != a.shape[-2]:
             raise ValueError(f"a must be a square matrix (*batch, d, d), got shape {tuple(a.shape)}")
-        check_finite(a, "a")
         d = a.shape[-1]
-        if b is not None:
-            check_finite(b, "b")
-            if b.dim() < 2 or b.shape[-2] != d:
-                raise ValueError(f"b must be (*batch, {d}, k) to fit a {tuple(a.shape)}, got {tuple(b.shape)}")
-        for name, tensor in (("noise_psd", noise_psd), ("b", b)):
-            if tensor is not None and tensor.dtype != a.dtype:
-                raise TypeError(f"{name} must have the dtype {a.dtype} of a, got {tensor.dtype}")
+        if b is not None and b.shape[-2] != d:
+            raise ValueError(f"b must be (*batch, {d}, k) to fit a {tuple(a.shape)}, got {tuple(b.shape)}")
         self.noise = _Noise(noise_psd, noise_input, d)
         hold(self, "a", a)
         if b is None:
