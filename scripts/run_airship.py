@@ -17,7 +17,7 @@ from jsonargparse import ArgumentParser
 
 FILTERS = (
     *("indirect", "indirect-ukf", "direct-ekf", "direct-ukf", "indirect-no-modes", "indirect-late-as-new"),
-    *("indirect-no-lag", "indirect-no-gate"),
+    *("indirect-no-lag", "indirect-no-gate", "indirect-no-modes-no-gate"),
 )
 
 EXAMPLES = """\

@@ -100,6 +100,7 @@ VARIANTS: dict[str, Variant] = {
     "indirect-late-as-new": Variant(delay=False),
     "indirect-no-lag": Variant(lag=False),
     "indirect-no-gate": Variant(gate=False),
+    "indirect-no-modes-no-gate": Variant(modes=False, gate=False),
 }
 FILTERS = tuple(VARIANTS)
 DEFAULT = ("indirect", "indirect-ukf", "direct-ekf", "direct-ukf", "indirect-no-modes", "indirect-late-as-new")
