@@ -110,6 +110,15 @@ def test_rows_go_separate_ways_and_hear_what_their_mode_hears():
     assert history.diagnostics.mode[:3, 0].tolist() == [0, 0, 1] and history.diagnostics.switch[1, 0] == 0
 
 
+def test_of_two_conditions_that_hold_the_first_is_taken():
+    ways = Switch("near", "away", "first", since(1.0)), Switch("near", "near", "second", since(1.0))
+    for order, target in ((ways, 1), (ways[::-1], 0)):
+        modes = make_modes(make_model(), ways=order)
+        history = modes(series(2), dt=DT)
+        assert [now.reason for now in switches(history, modes)] == [order[0].reason] * 3
+        assert history.final.belief.mode.tolist() == [target] * 3
+
+
 def test_each_mode_has_its_filter():
     """A linearisation in one mode, sigma points in the other: as the two filters called in turn, row by row."""
     model, ys = make_model(curved=True), series()

@@ -285,6 +285,15 @@ def test_modes_that_decay_need_not_be_seen_nor_driven(dtype):
     np.testing.assert_allclose(design.covariance[2, 2], 1e-4 / 2e-3, rtol=1e-5)
 
 
+def test_a_chain_of_equal_modes_that_decay_need_not_be_seen():
+    """Its eigenvalue is known to the cube root of the precision only, which is far from lasting for ever."""
+    chain = torch.diag(tensor([-1.0] * 3)) + torch.diag(tensor([1.0] * 2), 1)
+    system = ss(torch.block_diag(chain, tensor([[0.5]])), torch.zeros(4, 0, dtype=DOUBLE), tensor([[0.0, 0, 0, 1]]))
+    design = kalman(system, torch.eye(4, dtype=DOUBLE), tensor([[1.0]]))
+    # The chain takes no part: a filter of the last state alone, 2 a p + 1 - p^2 = 0.
+    np.testing.assert_allclose(design.gain[:, 0], [0, 0, 0, 0.5 + 1.25**0.5], rtol=1e-12, atol=1e-12)
+
+
 def oscillators(turn=True):
     """Undamped modes at ±2 i, ±3 i, and an integrator, in skew coordinates."""
     a = torch.block_diag(*[tensor([[0.0, w], [-w, 0]]) for w in (2, 3)], tensor([[0.0]]))
