@@ -737,6 +737,8 @@ X0 = torch.ones(3, dtype=DOUBLE)
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
+        (dict(model=A), TypeError, "model must be a StateSpaceModel, got Tensor"),
+        (dict(x0=[1.0, 1.0, 0.0]), TypeError, r"x0 must be a tensor \(\*batch, d\), got list"),
         (dict(x0=X0.float()), TypeError, "x0 must have the model's dtype torch.float64, got torch.float32"),
         (dict(x0=X0[:2]), ValueError, r"x0 must be \(\*batch, 3\), got shape \(2,\)"),
         (dict(x0=X0 * math.nan), ValueError, r"x0 must be finite, entry \(0,\) is nan"),

@@ -54,12 +54,14 @@ def empirical_gramian(
         predict_first: as in the filters' call: each step moves and then measures; False leaves the first motion out.
 
     Raises:
-        TypeError: dtypes. ValueError: shapes, NaN, a scale or time step out of range, controls and steps that disagree,
-            a measurement without noise, a run that leaves what is finite.
+        TypeError: no model, no tensor, dtypes. ValueError: shapes, NaN, a scale or time step out of range, controls and
+            steps that disagree, a measurement without noise, a run that leaves what is finite.
 
     Source: Lall, Marsden and Glavaski, A subspace approach to balanced truncation (2002), with unit rotations; Krener
         and Ide, Measures of unobservability (2009).
     """
+    if not isinstance(model, StateSpaceModel):
+        raise TypeError(f"model must be a StateSpaceModel, got {type(model).__name__}")
     space = model.prior().space
     sizes = _check(model, x0, controls, scale)
     count = _count(controls, steps)
@@ -105,6 +107,8 @@ def _differences(law: Gaussian, e: int) -> Tensor:
 def _check(model: StateSpaceModel, x0: Tensor, controls: Tensor | None, scale: Tensor | float) -> Tensor:
     """Perturbations (e,)."""
     prior = model.prior()
+    if not isinstance(x0, Tensor):
+        raise TypeError(f"x0 must be a tensor (*batch, d), got {type(x0).__name__}")
     if x0.dtype != prior.mean.dtype:
         raise TypeError(f"x0 must have the model's dtype {prior.mean.dtype}, got {x0.dtype}")
     if x0.shape[-1:] != prior.mean.shape[-1:]:
