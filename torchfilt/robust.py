@@ -110,7 +110,8 @@ class Reacquire(Filter[Guarded]):
         measured = ~torch.isnan(y[..., column]).any(-1)
         taken = info.accepted[..., self._place]
         span = dt.squeeze(-1) if isinstance(dt, Tensor) and dt.dim() else dt
-        refused_s = torch.where(measured, torch.where(taken, 0, belief.refused_s + span), belief.refused_s)
+        longer = belief.refused_s + span if predict else belief.refused_s  # at the prior's own time none has gone by
+        refused_s = torch.where(measured, torch.where(taken, 0, longer), belief.refused_s)
         again = refused_s >= self.patience_s
         if torch.compiler.is_compiling() or bool(again.any()):
             fresh = self._start(fallback, noise)

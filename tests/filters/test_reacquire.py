@@ -51,6 +51,15 @@ def test_it_starts_over_and_recovers(make):
     assert [(d.step, d.row) for d in log if d.restarted] == [(24, (0,))]
 
 
+def test_at_the_time_of_the_prior_no_time_has_gone_by():
+    ys = torch.tensor([[0.0, 50.0]] * 6, dtype=F64).unsqueeze(1)
+    starts = [
+        tf.Reacquire(INNER["gaussian"](), "fine", 0.5)(ys, dt=DT, predict_first=first).diagnostics.restarted[:, 0]
+        for first in (True, False)
+    ]
+    assert [int(found.int().argmax()) for found in starts] == [4, 5]
+
+
 @inner
 def test_rows_do_not_know_of_each_other(make):
     ys = series()
