@@ -27,8 +27,8 @@ from torch import Tensor, nn
 import torchfilt as tf
 from torchfilt.io.quad_baro_range import QuadBaroRange, read_quad_baro_range
 from torchfilt.laws import LinearForm
-from torchfilt.missions.attitude.study import digest, run_study
 from torchfilt.missions.stages import Arrays, check_names
+from torchfilt.missions.study import digest, run_study
 from torchfilt.models.attitude import multiply, rotate
 from torchfilt.models.attitude.kinematics import ATTITUDE_SPACE, GyroTransition, VectorMeasurement
 from torchfilt.models.attitude.rotations import from_rotation_vector
@@ -509,10 +509,10 @@ def run_height(
     return run_study(
         names,
         settings,
-        {"version": _VERSION, "flight": digest(flight)},
         out,
+        recipe=lambda name: {"version": _VERSION, **asdict(settings), "flight": digest(flight)},
         follow=lambda name: follow(name, flight, settings, progress),
-        summarize=lambda result: summarize(result, flight, settings),
+        summarize=lambda name, result: summarize(result, flight, settings),
         table=table,
         draw=(lambda results, folder: _figures(results, flight, settings, folder)) if figures else None,
         say=say,

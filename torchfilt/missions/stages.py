@@ -69,10 +69,13 @@ class Stages:
 
 
 def check_names(names: Sequence[str], known: Collection[str], what: str) -> None:
-    """Raise a ValueError unless there are names and all of them are known; ``what`` they name, in the plural."""
+    """Raise a ValueError unless there are names, all known and each given once; ``what`` they name, in the plural."""
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         raise ValueError(f"{what} must be out of {', '.join(known)}, got {', '.join(unknown) or 'none'}")
+    again = [name for k, name in enumerate(names) if name in names[:k]]
+    if again:
+        raise ValueError(f"{what} must be given once each, got {', '.join(dict.fromkeys(again))} again")
 
 
 def write_outcome(folder: Path, lines: Sequence[str], numbers: dict[str, Any]) -> None:

@@ -20,7 +20,8 @@ from torchfilt.missions.airship.navigation import (
     readings,
 )
 from torchfilt.missions.airship.scene import FILTER_RATE_HZ, AirshipSettings, Scene, make_scene
-from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.missions.stages import Arrays, check_names
+from torchfilt.missions.study import run_study
 from torchfilt.models.landing import LANDING_SPACE
 from torchfilt.modes import NavigationModes
 from torchfilt.types import Moded, StepInfo, trusted
@@ -197,28 +198,26 @@ def run_airship(
     """
     names = DEFAULT if filters is None else tuple(filters)
     check_names(names, FILTERS, "filters")
-    stages = Stages(Path(out) / "stages", say)
     say(f"{settings.runs} missions of {settings.steps / FILTER_RATE_HZ:g} s: {', '.join(PHASES)}")
     scene = make_scene(settings)
-    results: dict[str, Arrays] = {}
-    found: dict[str, Any] = {}
-    for name in names:
-        recipe = {"version": _VERSION, "filter": name, **settings.to_dict()}
-        kept = stages.has(name, recipe)
-        results[name] = stages.get(name, recipe, lambda name=name: run_filter(name, scene, progress))  # type: ignore[misc]
-        found[name] = summarize(results[name], scene, name)
-        say(f"{name:22s} " + ("as before" if kept else f"{results[name]['cpu_s'].sum():.1f} s of CPU"))
-    summary = {"filters": found, "settings": settings.to_dict(), "versions": versions()}
-    lines = [*table(summary), "", *log_lines(results[names[0]], scene, names[0])]
-    for line in lines:
-        say(line)
-    write_outcome(Path(out), lines, summary)
-    if figures:
+
+    def draw(results: dict[str, Arrays], folder: Path) -> list[Path]:
         from torchfilt.missions.airship.figures import airship_figures
 
-        for path in airship_figures(results, scene, Path(out) / "figures"):
-            say(f"wrote {path}")
-    return summary
+        return airship_figures(results, scene, folder)
+
+    return run_study(
+        names,
+        settings,
+        out,
+        recipe=lambda name: {"version": _VERSION, **settings.to_dict()},
+        follow=lambda name: run_filter(name, scene, progress),
+        summarize=lambda name, result: summarize(result, scene, name),
+        table=table,
+        notes=lambda results: ["", *log_lines(results[names[0]], scene, names[0])],
+        draw=draw if figures else None,
+        say=say,
+    )
 
 
 def table(summary: dict[str, Any]) -> list[str]:

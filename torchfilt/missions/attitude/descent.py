@@ -29,8 +29,8 @@ from torchfilt.io.rocket_descent import RocketDescent, read_rocket_descent
 from torchfilt.laws import hold
 from torchfilt.linalg import matrix_exp
 from torchfilt.missions.attitude.motion import to_ends
-from torchfilt.missions.attitude.study import digest, run_study
 from torchfilt.missions.stages import Arrays, check_names
+from torchfilt.missions.study import digest, run_study
 from torchfilt.models.attitude import (
     inverse,
     rotate,
@@ -535,10 +535,10 @@ def run_descent(
     return run_study(
         names,
         settings,
-        {"version": _VERSION, "descent": digest(descent)},
         out,
+        recipe=lambda name: {"version": _VERSION, **asdict(settings), "descent": digest(descent)},
         follow=lambda name: follow(name, descent, settings, progress),
-        summarize=lambda result: summarize(result, descent, settings),
+        summarize=lambda name, result: summarize(result, descent, settings),
         table=table,
         draw=(lambda results, folder: _figures(results, descent, folder)) if figures else None,
         say=say,

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 import torchfilt as tf
 from torchfilt.io.imu_mag_mocap import ImuMagLog, read_imu_mag_mocap
 from torchfilt.missions.attitude.motion import to_ends
-from torchfilt.missions.attitude.study import digest, run_study
 from torchfilt.missions.stages import Arrays, check_names
+from torchfilt.missions.study import digest, run_study
 from torchfilt.models.attitude import from_rotation_vector, inverse, multiply, rotate, to_rotation_vector
 from torchfilt.models.attitude.kinematics import ATTITUDE_SPACE, GyroTransition, VectorMeasurement
 from torchfilt.spaces import EUCLIDEAN
@@ -404,10 +404,10 @@ def run_imu_mag(
     return run_study(
         names,
         settings,
-        {"version": _VERSION, "motion": digest(motion)},
         out,
+        recipe=lambda name: {"version": _VERSION, **asdict(settings), "motion": digest(motion)},
         follow=lambda name: follow(name, motion, settings, progress),
-        summarize=lambda result: summarize(result, motion, settings),
+        summarize=lambda name, result: summarize(result, motion, settings),
         table=table,
         draw=(lambda results, folder: _figures(results, settings, folder)) if figures else None,
         say=say,

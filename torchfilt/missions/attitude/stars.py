@@ -12,7 +12,7 @@ NaN for the rest would say the same, at a multiple of the price.
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,8 @@ import torchfilt as tf
 from torchfilt.io.starry_night import Camera, StarryNight, read_starry_night
 from torchfilt.laws import hold
 from torchfilt.metrics import nees
-from torchfilt.missions.attitude.study import digest, run_study
 from torchfilt.missions.stages import Arrays, check_names
+from torchfilt.missions.study import digest, run_study
 from torchfilt.models.attitude import from_rotation_vector, inverse, mean_rotation, multiply, rotate, skew, to_matrix
 from torchfilt.particles import uniform_log_weights
 from torchfilt.spaces import EUCLIDEAN, Euclidean, Product, UnitQuaternion
@@ -455,10 +455,10 @@ def run_stars(
     return run_study(
         names,
         settings,
-        {"version": _VERSION, "log": digest((*log[:-3], *log.camera[:2], *log[-2:]))},
         out,
+        recipe=lambda name: {"version": _VERSION, **asdict(settings), "log": digest(log)},
         follow=lambda name: follow(name, log, settings, progress),
-        summarize=summarize,
+        summarize=lambda name, result: summarize(result),
         table=table,
         draw=_figures if figures else None,
         say=say,

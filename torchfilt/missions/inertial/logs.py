@@ -3,7 +3,6 @@
 Row 0 of a run has all fixes; each other row misses its own for the longest gap, and shorter gaps are how it began.
 """
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -33,7 +32,8 @@ from torchfilt.missions.inertial.log_scene import (
     make_gaps,
     read_log,
 )
-from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.missions.stages import Arrays, Stages, check_names
+from torchfilt.missions.study import digest, run_study
 from torchfilt.models.attitude import inverse, rotate, to_euler
 from torchfilt.particles import Particles
 from torchfilt.spaces import wrap_angle
@@ -427,56 +427,41 @@ def run_log(
     log, own = settings.log, VARIANTS[settings.log]
     names = DEFAULT[log] if variants is None else tuple(variants)
     check_names(names, own, "variants")
-    folder = Path(out)
-    stages = Stages(folder / "stages", say)
     data = read_log(settings)
     span = data.time_s[-1].item() - data.time_s[0].item()
     say(f"{log}: {LOGS[log]}; {len(data.time_s)} samples and {len(data.gnss.time_s)} fixes in {span:.0f} s")
-    summary: dict[str, Any] = {"log": log, "variants": {}}
+    more: dict[str, Any] = {"log": log}
     mounting = None
     if TUNING[log].axle_m is not None and any(own[name].aided for name in names):
+        stages = Stages(Path(out) / "stages", say)
         kept = stages.get("mounting", _recipe(settings, data), lambda: {"rad": np.array(find_mounting(data, settings))})
         mounting = Mounting(*kept["rad"].tolist())
-        summary["mounting_deg"] = {"yaw": math.degrees(mounting[0]), "pitch": math.degrees(mounting[1])}
-        say("nose seen from the sensors: {yaw:.2f} deg clockwise, {pitch:.2f} deg up".format(**summary["mounting_deg"]))
-    results: dict[str, Arrays] = {}
-    for name in names:
-        recipe = _recipe(settings, data, name)
-        before = stages.has(name, recipe)
-        turned = mounting if own[name].aided else None
-        results[name] = stages.get(
-            name,
-            recipe,
-            lambda name=name, turned=turned: run_variant(name, data, settings, turned, progress),  # type: ignore[misc]
-        )
-        summary["variants"][name] = summarize(results[name], settings)
-        say(f"{name:18s} " + ("as before" if before else f"{results[name]['cpu_s']:.1f} s of CPU"))
-    summary |= {"settings": settings.to_dict(), "versions": versions()}
-    lines = table(summary)
-    for line in lines:
-        say(line)
-    write_outcome(folder, lines, summary)
-    if figures:
+        more["mounting_deg"] = {"yaw": math.degrees(mounting[0]), "pitch": math.degrees(mounting[1])}
+        say("nose seen from the sensors: {yaw:.2f} deg clockwise, {pitch:.2f} deg up".format(**more["mounting_deg"]))
+
+    def draw(results: dict[str, Arrays], folder: Path) -> list[Path]:
         from torchfilt.missions.inertial.logs_figures import log_figures
 
-        for path in log_figures(results, settings, folder / "figures"):
-            say(f"wrote {path}")
-    return summary
+        return log_figures(results, settings, folder)
+
+    return run_study(
+        names,
+        settings,
+        out,
+        recipe=lambda name: _recipe(settings, data, name),
+        follow=lambda name: run_variant(name, data, settings, mounting if own[name].aided else None, progress),
+        summarize=lambda name, result: summarize(result, settings),
+        table=table,
+        draw=draw if figures else None,
+        say=say,
+        what="variants",
+        more=more,
+    )
 
 
 def _recipe(settings: LogSettings, log: InertialLog, name: str | None = None) -> dict[str, Any]:
     """What the result of a stage depends on."""
-    own = {"version": _VERSION, **settings.to_dict(), "tuning": asdict(TUNING[settings.log]), "data": _digest(log)}
+    own = {"version": _VERSION, **settings.to_dict(), "tuning": asdict(TUNING[settings.log]), "data": digest(log)}
     if name is None or VARIANTS[settings.log][name].filter != "rpf":
         del own["particles"], own["seed"]
     return own
-
-
-def _digest(log: InertialLog) -> str:
-    """Of all numbers that a filter is given or scored by."""
-    found = hashlib.sha256()
-    for part in (log, log.gnss, log.reference):
-        for value in part:
-            if isinstance(value, Tensor):
-                found.update(value.numpy().tobytes())
-    return found.hexdigest()

@@ -20,7 +20,8 @@ from torchfilt.missions.inertial.scene import (
     make_filter,
     make_scene,
 )
-from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.missions.stages import Arrays, check_names
+from torchfilt.missions.study import run_study
 from torchfilt.models.inertial.error_model import ERROR_SPACE
 from torchfilt.particles import Particles
 from torchfilt.recording import Series
@@ -158,33 +159,30 @@ def run_inertial(
     """
     names = DEFAULT[settings.scenario] if filters is None else tuple(filters)
     check_names(names, FILTERS, "filters")
-    folder = Path(out)
-    stages = Stages(folder / "stages", say)
     say(f"{settings.scenario}: {SCENARIOS[settings.scenario]}; {settings.runs} runs of {settings.steps} s")
     scene = make_scene(settings)
     away = torch.linalg.vector_norm(scene.truth[-1, :, 7:10], dim=-1)
+    open_loop_m = float(away.square().mean().sqrt())
+    say(f"without fixes the system is off by {open_loop_m:.0f} m at the end (rms of the runs)")
     measured = 3 if settings.scenario == "heading-unknown" else 4
-    summary: dict[str, Any] = {"scenario": settings.scenario, "open_loop_m": float(away.square().mean().sqrt())}
-    say(f"without fixes the system is off by {summary['open_loop_m']:.0f} m at the end (rms of the runs)")
-    results: dict[str, Arrays] = {}
-    summary["filters"] = {}
-    for name in names:
-        recipe = _recipe(name, settings)
-        kept = stages.has(name, recipe)
-        results[name] = stages.get(name, recipe, lambda name=name: run_filter(name, scene, settings, progress))  # type: ignore[misc]
-        summary["filters"][name] = summarize(results[name], measured)
-        say(f"{name:12s} " + ("as before" if kept else f"{results[name]['cpu_s'].sum():.1f} s of CPU"))
-    summary |= {"settings": settings.to_dict(), "versions": versions()}
-    lines = table(summary)
-    for line in lines:
-        say(line)
-    write_outcome(folder, lines, summary)
-    if figures:
+
+    def draw(results: dict[str, Arrays], folder: Path) -> list[Path]:
         from torchfilt.missions.inertial.figures import inertial_figures
 
-        for path in inertial_figures(results, scene, settings, folder / "figures"):
-            say(f"wrote {path}")
-    return summary
+        return inertial_figures(results, scene, settings, folder)
+
+    return run_study(
+        names,
+        settings,
+        out,
+        recipe=lambda name: _recipe(name, settings),
+        follow=lambda name: run_filter(name, scene, settings, progress),
+        summarize=lambda name, result: summarize(result, measured),
+        table=table,
+        draw=draw if figures else None,
+        say=say,
+        more={"scenario": settings.scenario, "open_loop_m": open_loop_m},
+    )
 
 
 _PARTICLES = ("sir", "rpf-plain", "rpf", "mpf", "mpf-window", "mpf-literal")

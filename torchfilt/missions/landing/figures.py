@@ -1,10 +1,11 @@
 """Figures of the landing study: paths before and after the beacon is seen, errors and convergence against time."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from torchfilt.learning.figures import save_figure
+from torchfilt.missions.figures import new_figure
 from torchfilt.missions.landing.scene import Scene
 from torchfilt.missions.stages import Arrays
 from torchfilt.particles import Particles
@@ -14,7 +15,6 @@ _BEFORE_S, _AFTER_S = 2.0, 11.0
 
 def landing_figures(results: dict[str, Arrays], scene: Scene, folder: Path) -> list[Path]:
     """Draw them; returns the files."""
-    folder.mkdir(parents=True, exist_ok=True)
     drawn = [_errors(results, scene, folder / "errors.png"), _paths(results, scene, folder / "paths.png")]
     return [*drawn, _particles(scene, folder / "particles.png")]
 
@@ -31,16 +31,9 @@ def _since_sight(values: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarr
     return clock * scene.dt, shifted
 
 
-def _new(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
-
-
 def _errors(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
     """Medians with the middle 80 %, and the share of the runs that are near; of the first ten filters."""
-    figure, axes = _new(2, 2, (11, 7))
+    figure, axes = new_figure(2, 2, (11, 7), "Errors at heading zero: median, 10 % to 90 % of the runs")
     parts = (("horizontal, m", slice(6, 8), 1.0), ("vertical, m", slice(8, 9), 1.0), ("tilt, deg", slice(0, 2), 57.3))
     for k, (name, result) in enumerate(list(results.items())[:10]):
         for axis, (title, part, unit) in zip(axes.flat, parts, strict=False):
@@ -58,8 +51,7 @@ def _errors(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
     for axis in axes[1]:
         axis.set_xlabel("s since the beacon was first seen")
     figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
-    figure.suptitle("Errors at heading zero: median, 10 % to 90 % of the runs")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)
     return path
 
 
@@ -73,7 +65,12 @@ def _particles(scene: Scene, path: Path) -> Path:
         "bootstrap, 200 particles": BootstrapFilter(scene.model, 200),
         "LLPF, 50 Gaussians": LocallyLinearizedParticleFilter(scene.model, 50),
     }
-    figure, axes = _new(1, len(trackers), (11, 5.5))
+    figure, axes = new_figure(
+        1,
+        len(trackers),
+        (11, 5.5),
+        "Particles of one vehicle at heading zero: before (orange) and after (blue) it sees the beacon",
+    )
     truth = scene.model.representative(scene.truth[:, 0])[..., 7:9].numpy()
     first = max(int(scene.acquired[0]), 1)
     last = min(first + round(3 / scene.dt), len(truth))
@@ -92,15 +89,19 @@ def _particles(scene: Scene, path: Path) -> Path:
         axis.plot(*truth[:last].T, color="0.3", linewidth=2)
         axis.plot(0, 0, "k+", markersize=12)
         axis.set(title=name, xlim=(-50, 50), ylim=(-50, 50), aspect="equal", xlabel="right, m", ylabel="forward, m")
-    figure.suptitle("Particles of one vehicle at heading zero: before (orange) and after (blue) it sees the beacon")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)
     return path
 
 
 def _paths(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
     names = list(results)[:8]
     rows = 1 + (len(names) > 4)
-    figure, axes = _new(rows, -(-len(names) // rows), (12, 3.4 * rows))
+    figure, axes = new_figure(
+        rows,
+        -(-len(names) // rows),
+        (12, 3.4 * rows),
+        "Pad frame turned to heading zero: truth grey, estimate dotted before the beacon is seen",
+    )
     truth = scene.model.representative(scene.truth)[..., 7:10].numpy()
     for axis, name in zip(axes.flat, names, strict=False):
         for run in range(min(6, truth.shape[1])):
@@ -112,6 +113,5 @@ def _paths(results: dict[str, Arrays], scene: Scene, path: Path) -> Path:
         axis.plot(0, 0, "k+")
         axis.set(title=name, xlim=(-40, 40), ylim=(-40, 40), aspect="equal", xlabel="right, m")
         axis.set_ylabel("forward, m")
-    figure.suptitle("Pad frame turned to heading zero: truth grey, estimate dotted before the beacon is seen")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)
     return path

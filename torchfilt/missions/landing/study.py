@@ -14,7 +14,8 @@ from torchfilt.filters.particle_methods import BootstrapFilter, LocallyLinearize
 from torchfilt.gates import Gate
 from torchfilt.gaussian import Gaussian
 from torchfilt.missions.landing.scene import SCENARIOS, LandingSettings, Scene, make_scene
-from torchfilt.missions.stages import Arrays, Stages, check_names, versions, write_outcome
+from torchfilt.missions.stages import Arrays, check_names
+from torchfilt.missions.study import run_study
 from torchfilt.model import StateSpaceModel
 from torchfilt.moments import taylor
 from torchfilt.particles import Particles
@@ -216,34 +217,30 @@ def run_landing(
     """
     names = DEFAULT if filters is None else tuple(filters)
     check_names(names, FILTERS, "filters")
-    stages = Stages(Path(out) / "stages", say)
     say(f"{settings.scenario}: {SCENARIOS[settings.scenario]}; {settings.runs} runs of {settings.duration_s:g} s")
     scene = make_scene(settings)
-    results: dict[str, Arrays] = {}
-    found: dict[str, Any] = {}
-    for name in names:
-        recipe = {"version": _VERSION, "filter": name, **settings.to_dict()}
-        kept = stages.has(name, recipe)
-        results[name] = stages.get(name, recipe, lambda name=name: run_filter(name, scene, settings.seed, progress))  # type: ignore[misc]
-        found[name] = summarize(results[name], scene.acquired, scene.dt)
-        found[name]["ms_one_vehicle"] = time_one_vehicle(name, settings)
-        say(f"{name:18s} " + ("as before" if kept else f"{results[name]['cpu_s'].sum():.1f} s of CPU"))
-    summary = {
-        "scenario": settings.scenario,
-        "filters": found,
-        "settings": settings.to_dict(),
-        "versions": versions(),
-    }
-    lines = table(summary)
-    for line in lines:
-        say(line)
-    write_outcome(Path(out), lines, summary)
-    if figures:
+
+    def numbers(name: str, result: Arrays) -> dict[str, Any]:
+        alone = {"ms_one_vehicle": time_one_vehicle(name, settings)}
+        return summarize(result, scene.acquired, scene.dt) | alone
+
+    def draw(results: dict[str, Arrays], folder: Path) -> list[Path]:
         from torchfilt.missions.landing.figures import landing_figures
 
-        for path in landing_figures(results, scene, Path(out) / "figures"):
-            say(f"wrote {path}")
-    return summary
+        return landing_figures(results, scene, folder)
+
+    return run_study(
+        names,
+        settings,
+        out,
+        recipe=lambda name: {"version": _VERSION, **settings.to_dict()},
+        follow=lambda name: run_filter(name, scene, settings.seed, progress),
+        summarize=numbers,
+        table=table,
+        draw=draw if figures else None,
+        say=say,
+        more={"scenario": settings.scenario},
+    )
 
 
 def table(summary: dict[str, Any]) -> list[str]:
