@@ -75,12 +75,15 @@ def chosen(text: str, known: Sequence[str]) -> list[str]:
     """Names of ``--filters``, separated by commas.
 
     Raises:
-        UsageError: none, or one that is not known.
+        UsageError: none, one that is not known, one twice.
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         raise UsageError(f"--filters takes {','.join(known)}; got {','.join(unknown) or 'none'}")
+    twice = [name for k, name in enumerate(names) if name in names[:k]]
+    if twice:
+        raise UsageError(f"--filters takes each name once; got {','.join(twice)} again")
     return names
 
 

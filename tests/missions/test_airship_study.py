@@ -137,6 +137,8 @@ def test_wrong_use_is_told(tmp_path, capsys):
     assert "runs must be at least 1, got 0" in capsys.readouterr().err
     assert run_airship.main(["--filters", "kalman", "--out", str(tmp_path / "a")]) == 2
     assert "--filters takes" in capsys.readouterr().err
+    assert run_airship.main(["--filters", "indirect,indirect", "--out", str(tmp_path / "a")]) == 2
+    assert "--filters takes each name once; got indirect again" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"filters must be out of .* got kalman"):
         study.run_airship(SHORT, tmp_path, ("kalman",))
 
