@@ -91,7 +91,7 @@ def test_filters_with_everything_for_each_row(particles):
 
     def model(row):
         motion = tf.LinearGaussian(
-            (0.3 * scale * eye)[row], (0.1 * scale * eye)[row], (scale[:, 0] * OFFSET)[row], control_matrix=B
+            (0.3 * scale * eye)[row], (0.1 * scale * eye)[row], (scale[:, 0] * OFFSET)[row], control_matrix=(scale * B)[row]
         )
         return tf.StateSpaceModel(prior, motion, tf.LinearGaussian(eye, (0.2 * scale * eye)[row]))
 
@@ -165,7 +165,7 @@ REFUSED = {
     "none": ({"covariance": None}, "exactly one of covariance= and scale_tril="),
     "offset": ({"offset": tensor([1.0])}, r"offset must end in 2 .*got \(1,\)"),
     "NaN in the offset": ({"offset": OFFSET * torch.nan}, r"offset must be finite, entry \(0,\) is nan"),
-    "control matrix": ({"control_matrix": B.T}, r"control_matrix must be \(2, k\), got shape \(1, 2\)"),
+    "control matrix": ({"control_matrix": B.T}, r"control_matrix must be \(\*batch, 2, k\), got shape \(1, 2\)"),
     "factor not square": (FACTOR | {"scale_tril": COVARIANCE[:1]}, r"scale_tril must be a square matrix .*\(1, 2\)"),
     "factor not lower": (FACTOR | {"scale_tril": COVARIANCE}, r"scale_tril must be lower .*\(0, 1\) is 0.2"),
     "factor not finite": (FACTOR | {"scale_tril": COVARIANCE.tril() * torch.nan}, "scale_tril must be finite"),

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torchfilt.gaussian import Gaussian
-from torchfilt.linalg import for_points, psd_factor
+from torchfilt.linalg import apply_factor, for_points, psd_factor
 from torchfilt.spaces import EUCLIDEAN, Space
 
 
@@ -81,7 +81,7 @@ class LinearGaussian(nn.Module):
         matrix: (m, d) or (*batch, m, d).
         covariance: (m, m) or (*batch, m, m), positive semidefinite; or give ``scale_tril``, its lower factor.
         offset: (m,), (*batch, m) or None.
-        control_matrix: (m, k) or None.
+        control_matrix: (m, k), (*batch, m, k) or None.
         trainable: make matrix, factor and offset `nn.Parameter`s.
 
     Raises:
@@ -114,8 +114,8 @@ class LinearGaussian(nn.Module):
             raise ValueError(f"covariance must be {m} x {m} to fit matrix {tuple(matrix.shape)}, got {noise_size}")
         if offset is not None and offset.shape[-1:] != (m,):
             raise ValueError(f"offset must end in {m} to fit matrix {tuple(matrix.shape)}, got {tuple(offset.shape)}")
-        if control_matrix is not None and (control_matrix.dim() != 2 or len(control_matrix) != m):
-            raise ValueError(f"control_matrix must be ({m}, k), got shape {tuple(control_matrix.shape)}")
+        if control_matrix is not None and (control_matrix.dim() < 2 or control_matrix.shape[-2] != m):
+            raise ValueError(f"control_matrix must be (*batch, {m}, k), got shape {tuple(control_matrix.shape)}")
         for name, tensor in (("offset", offset), ("control_matrix", control_matrix), ("covariance", self.noise())):
             if tensor is not None:
                 check_finite(tensor, name)
@@ -140,7 +140,7 @@ class LinearGaussian(nn.Module):
             if u is None:
                 raise ValueError("this law has a control_matrix but no control u was given")
             check_control(u, self.control_matrix)
-            push = u @ self.control_matrix.mT
+            push = _pushed(self.control_matrix, u)
             offset = push if offset is None else for_points(offset, 1, push.dim() - 1) + push
         return LinearForm(self.matrix, offset, self.noise())
 
@@ -273,6 +273,11 @@ def one_number(value: Tensor | float, name: str, *, zero: bool = False, dtype: t
         rule = "finite number >= 0" if zero else "positive finite number"
         raise ValueError(f"{name} must be one {rule}, got {value}")
     return number
+
+
+def _pushed(matrix: Tensor, u: Tensor) -> Tensor:
+    """``matrix @ u`` for controls (..., k); one matrix a row meets several points a row."""
+    return u @ matrix.mT if matrix.dim() == 2 else apply_factor(for_points(matrix, 2, u.dim() - 1), u)
 
 
 def check_control(u: Tensor, matrix: Tensor) -> None:

@@ -9,7 +9,14 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import torchfilt as tf
-from torchfilt.models.control import ContinuousLinear, ContinuousTransition, integrate_noise, noise_factor
+from torchfilt.models.control import (
+    ContinuousLinear,
+    ContinuousTransition,
+    integrate_noise,
+    linear_model,
+    noise_factor,
+    ss,
+)
 from torchfilt.spaces import Angle, Euclidean, Product, UnitQuaternion
 from torchfilt.testing import check_filter, check_law
 
@@ -128,6 +135,29 @@ def test_time_steps_a_row_and_batched_systems():
     points = law(x.unsqueeze(1).expand(3, 5, 2), u.unsqueeze(1), dt.unsqueeze(1))
     torch.testing.assert_close(points.mean[:, 3], whole.mean, rtol=1e-13, atol=1e-14)
     assert torch.equal(whole.mean[1], x[1]) and not whole.scale_tril[1].any()
+
+
+@pytest.mark.parametrize("shared", [False, True], ids=["control a row", "one control"])
+def test_a_batch_of_discrete_systems_is_each_alone(shared):
+    """Matrices of all kinds with a row each, in a Gaussian filter and in a bank of particles."""
+    a, b, c, d = (normal(3, *shape, seed=k) for k, shape in enumerate([(2, 2), (2, 1), (1, 2), (1, 1)]))
+    noise, own = 0.1 * torch.eye(2, dtype=DOUBLE), torch.eye(1, dtype=DOUBLE)
+    prior = tf.Gaussian(normal(2, seed=9), torch.eye(2, dtype=DOUBLE))
+    ys, us = normal(4, 3, 1, seed=10), normal(4, 1 if shared else 3, 1, seed=11)
+    us = us[:, 0] if shared else us
+    whole = linear_model(ss(0.5 * a, b, c, d, dt=1.0), noise, own, prior)
+    makers = (
+        tf.KalmanFilter,
+        tf.UnscentedKalmanFilter,
+        lambda model: tf.LocallyLinearizedParticleFilter(model, 4, split=1.0),
+    )
+    histories = [make(whole)(ys, us) for make in makers]
+    for k in range(3):
+        one = linear_model(ss(0.5 * a[k], b[k], c[k], d[k], dt=1.0), noise, own, prior)
+        alone = tf.KalmanFilter(one)(ys[:, k], us if shared else us[:, k])
+        for history in histories:
+            torch.testing.assert_close(history.mean[:, k], alone.mean, rtol=1e-11, atol=1e-12)
+            torch.testing.assert_close(history.log_likelihood[k], alone.log_likelihood, rtol=1e-11, atol=1e-12)
 
 
 def test_matrices_of_a_repeated_step_are_held_until_they_would_be_stale():
