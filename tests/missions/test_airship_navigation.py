@@ -74,13 +74,14 @@ def test_model_has_the_layout(climb, name):
     prior = model.prior((4,))
     assert prior.mean.shape == (4, layout.size) and prior.factor().shape[-2:] == (layout.size - 1,) * 2
     assert prior.space.size == model.transition.space.size == layout.size
-    wanted = ("mast", "barometer", "magnetometer", "beacons", "ultrasonic")
+    wanted = ("mast", "barometer", "compass", "magnetometer", "beacons", "ultrasonic")
     assert model.observation.names == (*wanted, "imu")[: len(wanted) + variant.direct]
     assert dict(zip(model.observation.names, model.observation.sizes, strict=True)) == {
         name: size
         for name, size in {
             "mast": 6,
             "barometer": 1,
+            "compass": 3,
             "magnetometer": 3,
             "beacons": 4,
             "ultrasonic": 1,
@@ -101,8 +102,8 @@ def test_measurement_laws_at_the_truth(variant):
     for name in set(told) - {"mast"}:
         at = model.observation.laws[name](x)
         z = (told[name] - at.mean) / at.scale_tril
-        if name == "magnetometer":
-            z = 3 * z  # the filter counts it three times as wide as it is
+        if name == "compass":
+            z = 3 * z  # at the mast the filter counts it three times as wide as it is
         z = z[~torch.isnan(z)]
         assert len(z) > 40 and between(z.square().sum(), len(z)), name
 
@@ -227,7 +228,8 @@ def test_alignment_counts_its_start_once(starts, name):
 
 def test_readings(climb):
     given = nav.readings(climb, nav.VARIANTS["indirect"])
-    assert set(given) == {"mast", "barometer", "magnetometer", "beacons", "ultrasonic"}
+    assert set(given) == {"mast", "barometer", "compass", "magnetometer", "beacons", "ultrasonic"}
+    assert set(nav.readings(climb, nav.VARIANTS["indirect-no-modes"])) == set(given) - {"compass"}
     moored = climb.phase == 0
     assert moored.sum() == 10 and (given["mast"][moored] == nav.moored()).all()
     assert given["mast"].shape == (130, 4, 6) and given["mast"][~moored].isnan().all()
@@ -269,7 +271,7 @@ def test_clamped_echoes_are_left_out(climb):
 # Modes ----------------------------------------------------------------------------------------------------------------
 
 LISTENS = {
-    "alignment": {"mast", "barometer", "magnetometer"},
+    "alignment": {"mast", "barometer", "compass"},
     "cruise": {"beacons", "barometer", "magnetometer"},
     "approach": {"beacons", "ultrasonic", "barometer", "magnetometer"},
 }
@@ -426,8 +428,8 @@ def test_gate_shuts_out_a_wrong_range(climb):
         start = filter.init((4,))
         start = start._replace(belief=start.belief._replace(mode=torch.ones(4, dtype=torch.long)))
         y = all_sensors(climb, filter.model)
-        wrong = filter.model.observation.pack({"beacons": y[:, filter.model.observation.columns[3]] + 10})
-        wrong[:, filter.model.observation.columns[3]][:, 1:] = torch.nan
+        wrong = filter.model.observation.pack({"beacons": y[:, filter.model.observation.columns[4]] + 10})
+        wrong[:, filter.model.observation.columns[4]][:, 1:] = torch.nan
         belief = filter.step(start, wrong, climb.controls[0], climb.dt)[0].belief
         place[name] = (trusted(belief).mean[:, 7:10] - climb.truth[0, :, 7:10]).norm(dim=-1)
     assert (place["indirect"] < 0.5).all() and (place["indirect-no-gate"] > 5).all()

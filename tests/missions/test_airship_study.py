@@ -86,7 +86,7 @@ def made_up(scene):
         "deviation": np.full((steps, runs, 15), math.radians(1.0)),
         "nees": np.full((steps, runs), 30.0),
         "switch": switch,
-        "accepted": np.ones((steps, runs, 5), bool),
+        "accepted": np.ones((steps, runs, 6), bool),
         "ok": np.ones((steps, runs), bool),
         "refiltered": np.array(7),
         "cpu_s": np.full(steps, 0.002),
@@ -96,7 +96,7 @@ def made_up(scene):
 def test_numbers_of_made_up_errors():
     scene = make_scene(AirshipSettings(runs=2, anchored_s=12.0, cruise_s=6.0, approach_s=6.0))
     result = made_up(scene)
-    result["accepted"][11, 0, 1] = result["accepted"][19, 1, 3] = False
+    result["accepted"][11, 0, 1] = result["accepted"][19, 1, 4] = False
     result["ok"][5, 1] = False
     found = study.summarize(result, scene, "indirect")
     for phase in study.PHASES:
@@ -108,7 +108,7 @@ def test_numbers_of_made_up_errors():
     assert found["aligned_s"] == pytest.approx(2.0) and found["refiltered"] == 7 and found["failed"] == 1
     assert found["switches"]["released from the mast before it was aligned"] == 1
     # Of 480 steps in two runs each second one has a barometer, each tenth one beacons; the sonar comes late.
-    assert found["refused"] == {"barometer": 1 / 480, "magnetometer": 0, "beacons": 1 / 96}
+    assert found["refused"] == {"barometer": 1 / 480, "compass": 0, "magnetometer": 0, "beacons": 1 / 96}
     assert found["ms_per_step"] == pytest.approx(2.0)
     assert study.log_lines(result, scene, "indirect") == [
         "run 0,  15.05 s: alignment -> cruise: released from the mast before it was aligned"

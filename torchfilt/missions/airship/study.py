@@ -27,7 +27,7 @@ from torchfilt.modes import NavigationModes
 from torchfilt.types import Moded, StepInfo, trusted
 
 # Results of another version of the arithmetic are not reused: raise this with it.
-_VERSION = 2
+_VERSION = 3
 PHASES = ("anchored", "cruise", "approach")
 SETTLE_S = 5.0
 """So much of each phase, at its start, is not scored."""
@@ -134,7 +134,7 @@ def summarize(result: Arrays, scene: Scene, name: str) -> dict[str, Any]:
     summary["refused"] = {
         sensor: float((~result["accepted"][..., k]).sum() / given[sensor])
         for k, sensor in enumerate(law.names)
-        if sensor != "mast" and given[sensor]
+        if sensor != "mast" and given.get(sensor)
     }
     summary["failed"] = int((~result["ok"]).any(0).sum())
     summary["refiltered"] = int(result["refiltered"])
