@@ -91,7 +91,10 @@ def test_filters_with_everything_for_each_row(particles):
 
     def model(row):
         motion = tf.LinearGaussian(
-            (0.3 * scale * eye)[row], (0.1 * scale * eye)[row], (scale[:, 0] * OFFSET)[row], control_matrix=(scale * B)[row]
+            (0.3 * scale * eye)[row],
+            (0.1 * scale * eye)[row],
+            (scale[:, 0] * OFFSET)[row],
+            control_matrix=(scale * B)[row],
         )
         return tf.StateSpaceModel(prior, motion, tf.LinearGaussian(eye, (0.2 * scale * eye)[row]))
 

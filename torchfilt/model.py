@@ -19,9 +19,9 @@ _SHORT_CUTS = ("linear_form", "pooled", "first_order")
 
 
 def _short_cuts(law: Callable[..., Conditional]) -> list[str]:
-    """What the law offers, with the space that belongs to a linear form, and the sensors it is made of."""
+    """What the law offers, the space that belongs to a linear form, the sensors and which components are exact."""
     found = [name for name in _SHORT_CUTS if hasattr(law, name)]
-    also = [name for name in ("names", "parts") if hasattr(law, name)]
+    also = [name for name in ("names", "parts", "exact") if hasattr(law, name)]
     return [*found, *also, "space"] if found and hasattr(law, "space") else [*found, *also]
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from torchfilt.exact import SPREAD, Verdict, examine, filled, keep_true
 from torchfilt.gaussian import LOG_2PI, Gaussian, cat_columns, mask_rows
 from torchfilt.linalg import apply_factor, cholesky_downdate, for_points, log_abs_diagonal, triangularize, whiten
 from torchfilt.spaces import EUCLIDEAN, Euclidean, Space, transport
@@ -409,19 +410,28 @@ def update(
         u, dt: control and time step of the motion that led here, for measurement laws that look at them.
         gate: decides, at the first linearisation, what of the measurement is taken in.
 
+    A law may name components of its error that have no noise by construction, ``exact``, a tuple of indices. One whose
+    predicted spread is zero to rounding is judged at the first linearisation, before the gate: where its residual is
+    zero to rounding too it counts as not measured; where it is not, the log-likelihood is -inf.
+
     Source: Garcia-Fernandez, Svensson, Morelande, Särkkä, IEEE TSP 63 (2015), for the iterated form.
     """
     line = rule.linearize(law, prior, u, dt)
     if y.shape[-1] != line.mean.shape[-1]:
         raise ValueError(f"the measurement has {y.shape[-1]} numbers, the observation law gives {line.mean.shape[-1]}")
-    observed, decision = _observed(line.space, y, missing), None
+    observed, decision, exact = _observed(line.space, y, missing), None, None
+    if getattr(law, "exact", ()):
+        exact = _exact_rows(law, prior, line, y, observed, rule, u, dt)
+        observed = exact.observed
     if gate is not None:
         decision = gate(law, line, _innovation(line, y, observed), observed)
         observed = decision.kept
     result = _condition(prior, line, None, y, observed)
     for _ in range(iterations - 1):
-        line, back = _again(law, prior, result.belief, rule, u, dt)
+        line, back = _again(law, prior, result.belief, rule, u, dt, exact is not None)
         result = _condition(prior, line, back, y, observed)
+    if exact is not None:
+        result = _held(law, line, result, exact, y, u, dt)
     if decision is None:
         return result
     log_likelihood = result.log_likelihood + decision.log_density
@@ -429,7 +439,13 @@ def update(
 
 
 def _again(
-    law: Law, prior: Gaussian, posterior: Gaussian, rule: Rule, u: Tensor | None, dt: Tensor | float | None
+    law: Law,
+    prior: Gaussian,
+    posterior: Gaussian,
+    rule: Rule,
+    u: Tensor | None,
+    dt: Tensor | float | None,
+    may_be_singular: bool = False,
 ) -> tuple[Linearization, Tensor]:
     """Linearised about the posterior, by the prior's whitened error; and what that says of the prior's own mean."""
     space = prior.space
@@ -438,10 +454,107 @@ def _again(
     if isinstance(rule, Taylor):  # a derivative, which takes any columns: the way back is one more
         line = rule.linearize(law, posterior._replace(scale_tril=cat_columns(columns, away.unsqueeze(-1))), u, dt)
         return line._replace(slope=line.slope[..., :-1]), line.slope[..., -1]
+    if may_be_singular:
+        posterior = posterior._replace(scale_tril=filled(posterior.factor(), columns))
     line = rule.linearize(law, posterior, u, dt)
     # slope S_posterior^-1 is the law's Jacobian; carry it back to the prior's own factor and mean.
     jacobian = torch.linalg.solve_triangular(posterior.factor(), line.slope, upper=False, left=False)
     return line._replace(slope=jacobian @ columns), apply_factor(jacobian, away)
+
+
+class _Exact(NamedTuple):
+    """Exact rows of a measurement: components there and those still to be taken in (..., e), and for `keep_true`."""
+
+    picked: tuple[int, ...]
+    there: Tensor
+    observed: Tensor
+    verdict: Verdict
+    rows: Tensor
+    floor: Tensor
+
+
+def _exact_rows(
+    law: Any,
+    prior: Gaussian,
+    line: Linearization,
+    y: Tensor,
+    observed: Tensor | None,
+    rule: Rule,
+    u: Tensor | None,
+    dt: Tensor | float | None,
+) -> _Exact:
+    """Judge the exact rows. All are thresholds and rounding: nothing here carries a derivative."""
+    picked = list(law.exact)
+    innovation = _innovation(line, y, observed)
+    there = innovation.new_ones(innovation.shape[-1], dtype=torch.bool) if observed is None else observed
+    present, residual = there[..., picked], innovation.detach()[..., picked]
+    eps, root = torch.finfo(y.dtype).eps, prior.factor().detach()
+    # Each row by one error of the state at a time, as large as the prior knows it: |J_i| |S_i|.
+    size = root.norm(dim=-1)
+    apart = Gaussian(prior.mean.detach(), torch.diag_embed(size), prior.space)
+    slopes = _by_derivative(rule).linearize(law, apart, u, dt).slope.detach()[..., picked, :]
+    magnitude = _magnitude(law, line, prior.mean.detach(), u, dt)[..., picked] + residual.abs()
+    floor = SPREAD * eps * slopes.abs().sum(-1)
+    differences = _differences(rule, prior)
+    if differences > 0:
+        floor = floor + 16 * eps * differences * magnitude
+    top = cat_columns(line.slope, line.spread()).detach()[..., picked, :]
+    verdict = examine(top, residual, present, floor, magnitude)
+    member = torch.nn.functional.one_hot(torch.tensor(picked, device=y.device), there.shape[-1]).to(torch.bool)
+    idle = (verdict.idle.unsqueeze(-1) & member).any(-2)
+    rows = slopes / torch.where(size > 0, size, 1).unsqueeze(-2)
+    return _Exact(law.exact, there, there & ~idle, verdict, rows, floor)
+
+
+def _by_derivative(rule: Any) -> Rule:
+    """The rule, or in place of a quadrature, whose slopes are rounded by what it is spread over, the derivative."""
+    if isinstance(rule, SigmaPoints):
+        return Taylor()
+    inner = getattr(rule, "rule", None)
+    return rule._replace(rule=Taylor()) if isinstance(inner, SigmaPoints) else rule
+
+
+def _magnitude(law: Any, line: Linearization, x: Tensor, u: Tensor | None, dt: Tensor | float | None) -> Tensor:
+    """Size of the terms that a predicted measurement is the sum of, (..., e): sum_i |dh/dx_i x_i| + |h|."""
+    linear_form = getattr(law, "linear_form", None)
+    if linear_form is not None:
+        terms = for_points(linear_form(u, dt).matrix, 2, x.dim() - 1) * x.unsqueeze(-2)
+    else:
+        terms = _first_order(lambda *at: law(*at), x, torch.diag_embed(x), EUCLIDEAN, u, dt)[1]
+    own = line.space.local(torch.zeros_like(line.mean), line.mean)  # an exact component is Euclidean: h itself
+    return (terms.abs().sum(-1) + own.abs()).detach()
+
+
+def _differences(rule: Any, prior: Gaussian) -> float:
+    """How much a rule that takes differences of law values enlarges their rounding; 0 for derivatives."""
+    rule = getattr(rule, "rule", rule)
+    if not isinstance(rule, SigmaPoints):
+        return 0.0
+    reach = _quadrature(rule.build, prior.tangent_size, prior.mean.dtype, prior.mean.device).reach
+    return max(1.0, 1 / reach) if reach > 0 else 1.0
+
+
+def _held(
+    law: Law,
+    line: Linearization,
+    result: Update,
+    exact: _Exact,
+    y: Tensor,
+    u: Tensor | None,
+    dt: Tensor | float | None,
+) -> Update:
+    """The posterior with its exact rows kept true to its own rounding, and impossible where they contradict it."""
+    belief, verdict = result.belief, exact.verdict
+    factor, mean = belief.factor(), belief.mean
+    held, x = factor.detach(), mean.detach()
+    left = _innovation(line._replace(mean=law(x, u, dt).mean.detach()), y, exact.there)[..., list(exact.picked)]
+    left = torch.where(left.abs() <= verdict.limit, left, 0)
+    kept, move = keep_true(held, exact.rows, left, exact.there[..., list(exact.picked)], exact.floor)
+    # Only rounding is taken away: the derivative stays that of the update.
+    mean = mean + (belief.space.retract(x, move) - x).detach()
+    belief = Gaussian(mean, factor + (kept - held).detach(), belief.space)
+    log_likelihood = torch.where(verdict.contradicted, -torch.inf, result.log_likelihood)
+    return result._replace(belief=belief, log_likelihood=log_likelihood)
 
 
 def _innovation(line: Linearization, y: Tensor, observed: Tensor | None) -> Tensor:

@@ -19,11 +19,17 @@ Step = Tensor | float | None
 class PseudoMeasurement(nn.Module):
     """A constraint ``h(x) = value`` as a measurement that is always there: ``value ~ N(h(x), diag(sd^2))``.
 
-    Soft where sd > 0. Exact where sd = 0: for Gaussian filters and for particles that carry covariances; a point meets
-    an exact constraint with probability zero, so that filters of points fail on it. Each use counts as information: a
-    soft constraint that is applied at each step is a measurement with independent errors at each step. An exact one
-    that holds already, because nothing has moved the state off it since the last time, divides zero by zero: leave it
-    out of such steps (None), or give it a small width.
+    Soft where sd > 0: each use counts as information, a measurement with independent errors at each step. Exact where
+    sd is zero from the start and no parameter: for Gaussian filters and for particles that carry covariances; a point
+    meets an exact constraint with probability zero, so that filters of points fail on it.
+
+    An exact one that holds already, because nothing has moved the state off it or because others imply it, counts as
+    not measured: its predicted deviation is below 128 eps of the terms that it is the sum of. Where another value is
+    given there, the row fails with a log-likelihood of -inf, and a member of a bank or a mixture has no weight. Motion
+    keeps a constraint only if its noise does: give that by ``scale_tril``, a covariance's root has zeros to sqrt(eps).
+    A curved constraint holds once the linearisations about it agree, and until then counts at each use. Laws beside an
+    exact constraint must have forward derivatives, and no gradient goes through a covariance that it made singular.
+    A gate does not refuse a contradiction.
 
     A part of `Sensors`, whose `Sensors.pack` and `Sensors.complete` write ``value`` into the measurement.
 
@@ -45,6 +51,7 @@ class PseudoMeasurement(nn.Module):
 
     sd: Tensor
     value: Tensor
+    exact: tuple[int, ...]
     matrix: Tensor
     linear_form: Callable[..., LinearForm]
     first_order: Callable[..., tuple[Gaussian, Tensor]]
@@ -66,6 +73,10 @@ class PseudoMeasurement(nn.Module):
             hold(self, name, _vector(given, size, name))
         if (self.sd.detach() < 0).any():
             raise ValueError(f"sd must not be negative, got {self.sd.detach().min().item()}")
+        if not self.sd.requires_grad:
+            zero = (self.sd == 0).nonzero().squeeze(-1).tolist()
+            if zero:
+                self.exact = tuple(zero)
         self.function: Callable[..., Tensor] | None = None
         if isinstance(function, Tensor):
             if function.dim() != 2 or len(function) != size:
@@ -114,6 +125,7 @@ class Sensors(nn.Module):
     `linear_form` and `first_order` are offered where each law offers one of them, `linear_in` where all that are not
     linear agree on it.
 
+    A law may name by ``exact`` the components of its error that have no noise by construction; theirs are joined.
     A law may say by ``in_view(x) -> bool (...)`` from which states it sees anything: see `hide`.
 
     Args:
@@ -135,6 +147,7 @@ class Sensors(nn.Module):
     linear_form: Callable[..., LinearForm]
     first_order: Callable[..., tuple[Gaussian, Tensor]]
     linear_in: slice | tuple[int, ...]
+    exact: tuple[int, ...]
 
     def __init__(self, laws: Mapping[str, Law] | None = None, /, **more: Law) -> None:
         super().__init__()
@@ -177,6 +190,9 @@ class Sensors(nn.Module):
             self.linear_form = self._linear_form
         if all(known or hasattr(law, "first_order") for law, known in zip(laws, linear, strict=True)):
             self.first_order = self._first_order
+        exact = [part.start + k for law, part in zip(laws, self.parts, strict=True) for k in getattr(law, "exact", ())]
+        if exact:
+            self.exact = tuple(exact)
         declared = [getattr(law, "linear_in", None) for law, known in zip(laws, linear, strict=True) if not known]
         if declared and declared[0] is not None and all(one == declared[0] for one in declared):
             self.linear_in = declared[0]

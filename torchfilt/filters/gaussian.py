@@ -1,5 +1,6 @@
 """Gaussian filters: one square-root recursion, one moment rule; the named methods differ by the rule."""
 
+import torch
 from torch import Tensor
 
 from torchfilt.gates import Gate, as_gate, by_sensor
@@ -93,6 +94,8 @@ class GaussianFilter(Filter[Gaussian]):
         # NaN and infinity survive a sum, and only what is neither leaves nothing when it is taken from itself.
         probe = result.log_likelihood + posterior.mean.sum(-1) + posterior.scale_tril.sum((-2, -1))
         ok = probe - probe == 0
+        if getattr(self.model.observation, "exact", ()):  # one that is contradicted leaves a belief that looks healthy
+            posterior = posterior._replace(mean=torch.where(ok.unsqueeze(-1), posterior.mean, torch.nan))
         info = StepInfo(
             result.log_likelihood,
             ok,

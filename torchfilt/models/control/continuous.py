@@ -319,8 +319,8 @@ def linear_model(
     """A linear system with noise as a model for every filter: discrete laws, or exact ones of any dt.
 
     Args:
-        system: `StateSpace` or ``control.StateSpace``. A continuous one moves between measurements; these are taken at
-            instants.
+        system: `StateSpace` or ``control.StateSpace``, or a batch of them. A continuous one moves between
+            measurements; these are taken at instants.
         process_noise: of a discrete system the covariance of w in x' = A x + B u + F w, of a continuous one its
             spectral density; (w, w).
         measurement_noise: covariance of a measurement (m, m). A density R of continuous measurements, averaged over dt,
