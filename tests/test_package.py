@@ -53,7 +53,7 @@ LAYERS = [
     ["lazy", "linalg", "quaternions", "storage"],
     ["spaces"],
     ["gaussian", "particles", "noise"],
-    ["types"],
+    ["types", "exact"],
     ["moments", "resampling", "laws", "history"],
     ["symmetry", "gates", "mixture"],
     ["model", "gp", "recording", "kernels", "sensors"],
