@@ -3,11 +3,26 @@
     python benchmarks/bench_landing.py [--compiled] [--rounds 11] [--json FILE] [--write] [--quick]
 
 CPU time of one thread, float64, one vehicle whose beacon is in view; medians over interleaved rounds of 40 steps.
-`--compiled` adds the banks through `torch.compile(fullgraph=True)`, which takes minutes to compile; every run checks
-that they give what the eager ones give. `two factorisations` is what LAPACK alone takes for the two QR factorisations
+`--compiled` adds the bank of 200 through `torch.compile(fullgraph=True)`, which takes minutes to compile; every run
+checks that it gives what the eager one gives. `two factorisations` is what LAPACK alone takes for the two QR factorisations
 of a bank's step, the floor of a square-root filter. `--write` puts the result here:
 
 -- last result --
+2026-11-25, one thread of a x86_64 processor with AVX-512, 2 cores, Linux
+python 3.11.7, torch 2.13.0+cpu, torchfilt 0.1.0
+
+15 error components, barometer and beacon:
+
+                            ms a step  of 25 ms
+--------------------------  ---------  --------
+ukf                              2.26     0.090
+llpf-50                          3.13     0.125
+two factorisations of 50         0.31     0.012
+llpf-200                         6.17     0.247
+llpf-200 compiled                4.88     0.195
+two factorisations of 200        1.29     0.052
+llpf-1000                       31.03     1.241
+two factorisations of 1000       7.29     0.292
 -- end of the last result --
 """
 
@@ -68,7 +83,8 @@ def rows_of(scene: Scene, sizes: tuple[int, ...], compiled: bool) -> dict[str, R
         bank = tf.LocallyLinearizedParticleFilter(scene.model, n)
         eager = run_of(bank, scene, bank.advance)
         rows[f"llpf-{n}"] = Row(eager)
-        if compiled:
+        # All sizes share one code object, whose recompilations torch limits; it is 200 members that must be in time.
+        if compiled and (n == 200 or len(sizes) == 1):
             other = run_of(bank, scene, torch.compile(bank.advance, fullgraph=True))
             torch.testing.assert_close(other(), eager(), rtol=0, atol=1e-9)
             rows[f"llpf-{n} compiled"] = Row(other)
@@ -88,7 +104,7 @@ def run_steps(scene: Scene, sizes: tuple[int, ...], compiled: bool, rounds: int)
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     """Run, print, and write what is asked for; returns the JSON content."""
     parser = argparse.ArgumentParser(description="Landing filters against real time.")
-    parser.add_argument("--compiled", action="store_true", help="time compiled banks too")
+    parser.add_argument("--compiled", action="store_true", help="time the bank of 200 compiled too")
     parser.add_argument("--rounds", type=int, default=11, help="interleaved rounds (default 11)")
     parser.add_argument("--json", metavar="FILE", help="write all times, ratios and versions there")
     parser.add_argument("--write", action="store_true", help="put the result into this file's docstring")
