@@ -4,8 +4,8 @@
 
 CPU time of one thread, float64, one vehicle whose beacon is in view; medians over interleaved rounds of 40 steps.
 `--compiled` adds the bank of 200 through `torch.compile(fullgraph=True)`, which takes minutes to compile; every run
-checks that it gives what the eager one gives. `two factorisations` is what LAPACK alone takes for the two QR factorisations
-of a bank's step, the floor of a square-root filter. `--write` puts the result here:
+checks that it gives what the eager one gives. `two factorisations` is what LAPACK alone takes for the two QR
+factorisations of a bank's step, the floor of a square-root filter. `--write` puts the result here:
 
 -- last result --
 2026-11-25, one thread of a x86_64 processor with AVX-512, 2 cores, Linux
