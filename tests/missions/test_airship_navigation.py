@@ -12,6 +12,7 @@ import torchfilt as tf
 from torchfilt.filters.gaussian import GaussianFilter
 from torchfilt.missions.airship import TRUTH_NAMES, AirshipSettings, make_scene
 from torchfilt.missions.airship import navigation as nav
+from torchfilt.missions.airship.scene import BEACONS_M
 from torchfilt.modes import Situation, switches
 from torchfilt.moments import taylor
 from torchfilt.types import Moded, StepInfo, trusted
@@ -44,6 +45,12 @@ def direct_truth(scene):
 def between(total, count):
     """Whether a sum of squares of standard normals has the size of so many."""
     return chi2.ppf(RARE, count) < float(total) < chi2.isf(RARE, count)
+
+
+def within(error, covariance, components):
+    """Whether errors (..., e) of normal numbers are all as large as their variances allow, one check for the whole."""
+    scaled = error.square() / covariance.diagonal(dim1=-2, dim2=-1)[..., components]
+    return bool((scaled < chi2.isf(RARE / scaled.numel(), 1)).all())
 
 
 def packed(scene, variant, model, named=None):
@@ -145,7 +152,13 @@ def test_motion_at_the_truth(climb):
     z = (away / law.factor().diagonal(dim1=-2, dim2=-1)).flatten(0, 1)
     for part in (slice(0, 3), slice(3, 6), slice(9, 12), slice(12, 15), slice(16, 17)):
         assert between(z[:, part].square().sum(), z[:, part].numel()), part
-    assert away[..., 6:9].abs().max() < 1e-3 and away[..., 15].abs().max() < 1e-3 and (away[..., 17:] == 0).all()
+    # Half a step of the velocity's noise, and the jerk of at most 2 m/s^3 where the thrust jumps.
+    off = away[..., 6:9] - climb.dt / 2 * away[..., 3:6]
+    assert off.abs().max() < climb.dt**3 / 12 * 2 and (away[..., 17:] == 0).all()
+    # The lag follows a straight line from height to height: the error of the height, the sagitta's mean on top.
+    bend = climb.dt**2 / 12 * (climb.truth[..., 6].diff(dim=0) / climb.dt).abs().max()
+    lag = climb.dt / climb.settings.barometer_lag_s
+    assert away[..., 15].abs().max() < lag * (away[..., 8].abs().max() + bend)
 
 
 def test_motion_of_the_direct_form_at_the_truth(climb):
@@ -158,7 +171,8 @@ def test_motion_of_the_direct_form_at_the_truth(climb):
     # Half the turn of a step, 0.01 rad, of a turn by the new rate of 1e-3 rad.
     torch.testing.assert_close(away[..., :3], climb.dt * turn, rtol=0, atol=1e-5)
     torch.testing.assert_close(away[..., 3:6], climb.dt * away[..., 18:21], rtol=0, atol=1e-12)
-    assert (away[..., 6:9] - climb.dt**2 / 2 * away[..., 18:21]).abs().max() < 1e-3
+    # The acceleration is not constant over the step: a jerk of at most 2 m/s^3 where the thrust jumps.
+    assert (away[..., 6:9] - climb.dt**2 / 2 * away[..., 18:21]).abs().max() < climb.dt**3 / 12 * 2
     assert away[..., 15:18].abs().max() > 1e-3 and away[..., 18:21].abs().max() > 1e-2
     # The walks are the simulator's, the processes the stated guess.
     for part in (slice(9, 12), slice(12, 15)):
@@ -190,13 +204,19 @@ def test_prior_contains_the_truth(starts, name):
         assert between(scaled[:, k].sum(), STARTS.runs), k
     for k in (*range(9), own.lagged - 1):
         assert scaled[:, k].sum() < chi2.isf(RARE, STARTS.runs), k
-        assert scaled[:, k].max() < 9, k
+        assert scaled[:, k].max() < chi2.isf(RARE / STARTS.runs, 1), k
     whole = torch.linalg.solve(covariance, error.unsqueeze(-1)).squeeze(-1) * error
     assert whole.sum() < chi2.isf(RARE, STARTS.runs * error.shape[-1])
-    # Degrees, not tens of them.
-    assert error[:, :2].square().mean().sqrt() < math.radians(1) and error[:, 2].square().mean().sqrt() < math.radians(
-        4
-    )
+    # The claim itself: each direction tells the turns across it, to its own deviation over its length.
+    information = np.zeros((3, 3))
+    up, field = np.array([0, 0, 9.80665]), nav.earth_field_ut().numpy()
+    for direction, sd in ((up, nav._FORCE_SD_M_S2), (field, nav._FIELD_SD_UT)):
+        length = np.linalg.norm(direction)
+        information += (np.eye(3) - np.outer(direction, direction) / length**2) * (length / sd) ** 2
+    expected = np.sqrt(np.linalg.inv(information).diagonal())
+    # Measured lengths: hard iron of 1 of 48 makes 4 % of a variance a run, five standard errors of 300 runs are 1.2 %.
+    claimed = np.sqrt(covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(0).numpy())
+    np.testing.assert_allclose(claimed, expected, rtol=0.012)
 
 
 @pytest.mark.parametrize("name", ["indirect", "direct-ekf"])
@@ -257,7 +277,8 @@ def test_late_readings_are_of_the_step_before(climb):
         return ((sonar[lag:] - law(x).mean) / law(x).scale_tril)[heard].square().sum()
 
     assert heard.sum() > 150 and between(squares(climb.truth[:-lag]), int(heard.sum()))
-    assert squares(climb.truth[lag:]) > 3 * heard.sum()
+    # Climbing at up to 0.2 m/s it is up to 10 cm higher, of 2 cm.
+    assert squares(climb.truth[lag:]) > chi2.isf(RARE, int(heard.sum()))
 
 
 def test_clamped_echoes_are_left_out(climb):
@@ -386,10 +407,10 @@ def run(scene, name, steps=slice(None)):
 
 @pytest.mark.parametrize("name", nav.FILTERS)
 def test_filters_run(climb, name):
-    """Twenty steps, over the release after half a second: finite, and within reach of the truth."""
+    """Twenty steps, over the release after half a second: finite, as far from the truth as claimed, within 1e-6."""
     filter, history = run(climb, name, slice(20))
     assert history.mean.shape[:2] == (20, 4) and history.mean.isfinite().all() and history.covariance.isfinite().all()
-    assert (history.mean[-1, :, 7:10] - climb.truth[19, :, 7:10]).abs().max() < 1
+    assert within(history.mean[-1, :, 7:10] - climb.truth[19, :, 7:10], history.covariance[-1], slice(6, 9))
     if nav.VARIANTS[name].modes:
         log = list(switches(history, filter))
         assert [(one.step, one.row, one.target, one.reason) for one in log] == [
@@ -402,12 +423,13 @@ def test_filters_run(climb, name):
 
 @pytest.mark.parametrize("name", ["indirect", "direct-ekf"])
 def test_single_precision(climb, name):
-    """Fifteen steps over the release: place to a centimetre of what double precision gives."""
+    """Fifteen steps over the release: place as in double precision, to rounding of 40 m, the hall's length, a step."""
     variant, filter = nav.VARIANTS[name], nav.make_filter(name, climb)
     ys, u = packed(climb, variant, filter.model)[:15], None if variant.direct else climb.controls[:15]
     wanted = filter(ys, u, climb.dt).mean
     found = filter.to(torch.float32)(ys.float(), None if u is None else u.float(), climb.dt).mean
-    assert found.dtype == torch.float32 and (found[..., 7:10] - wanted[..., 7:10]).abs().max() < 0.01
+    assert found.dtype == torch.float32
+    assert (found[..., 7:10] - wanted[..., 7:10]).abs().max() < 15 * 40 * torch.finfo(torch.float32).eps
 
 
 def test_rules_and_gates(climb):
@@ -421,18 +443,27 @@ def test_rules_and_gates(climb):
 
 
 def test_gate_shuts_out_a_wrong_range(climb):
-    """A range ten metres too long moves the belief where there is no gate."""
-    place = {}
+    """A range ten metres too long: behind the gate as if there were none; without it, the gain times the innovation."""
+    beacon = torch.tensor(BEACONS_M[0], dtype=torch.float64)
     for name in ("indirect", "indirect-no-gate"):
         filter = nav.make_filter(name, climb)
         start = filter.init((4,))
         start = start._replace(belief=start.belief._replace(mode=torch.ones(4, dtype=torch.long)))
-        y = all_sensors(climb, filter.model)
-        wrong = filter.model.observation.pack({"beacons": y[:, filter.model.observation.columns[4]] + 10})
-        wrong[:, filter.model.observation.columns[4]][:, 1:] = torch.nan
-        belief = filter.step(start, wrong, climb.controls[0], climb.dt)[0].belief
-        place[name] = (trusted(belief).mean[:, 7:10] - climb.truth[0, :, 7:10]).norm(dim=-1)
-    assert (place["indirect"] < 0.5).all() and (place["indirect-no-gate"] > 5).all()
+        ranges = torch.full((4, 4), torch.nan, dtype=torch.float64)
+        silent, wrong = (filter.model.observation.pack({"beacons": y}) for y in (ranges, ranges.clone()))
+        long = torch.linalg.vector_norm(climb.truth[0, :, 7:10] - beacon, dim=-1) + 10
+        wrong[:, filter.model.observation.columns[4].start] = long
+        before, after = (trusted(filter.step(start, y, climb.controls[0], climb.dt)[0].belief) for y in (silent, wrong))
+        moved = after.mean[:, 7:10] - before.mean[:, 7:10]
+        if name == "indirect":
+            assert (moved == 0).all()
+            continue
+        apart = before.mean[:, 7:10] - beacon
+        distance = torch.linalg.vector_norm(apart, dim=-1, keepdim=True)
+        spread = before.covariance[:, 6:9, 6:9] @ (apart / distance).unsqueeze(-1)
+        variance = (apart / distance * spread.squeeze(-1)).sum(-1, keepdim=True) + climb.settings.beacon_sd_m**2
+        expected = spread.squeeze(-1) / variance * (long.unsqueeze(-1) - distance)
+        torch.testing.assert_close(moved, expected, rtol=1e-10, atol=1e-12)
 
 
 def test_unknown_filter(climb):
@@ -445,20 +476,22 @@ def test_unknown_filter(climb):
 
 
 def delayed(scene, name):
-    """Errors (t, R) of the height and modes (t, R) of a run that takes the sonar's readings as late."""
+    """Errors (t, R) of the height, deviations claimed and modes of a run that takes the sonar's readings as late."""
     variant, filter = nav.VARIANTS[name], nav.make_filter(name, scene)
     ys = packed(scene, variant, filter.model)
     sonar, lag = nav.late_readings(scene)
     stream = tf.DelayedMeasurements(filter, horizon_s=0.5)
     state = stream.init((scene.settings.runs,))
-    errors, modes = [], []
+    errors, claims, modes = [], [], []
     for k in range(len(scene.truth)):
         state, _ = stream.step(state, ys[k], None if variant.direct else scene.controls[k], scene.dt)
         if variant.delay and k >= lag and not sonar[k].isnan().all():
             state, _ = stream.late(state, {"ultrasonic": sonar[k]}, (k + 1 - lag) * scene.dt)
         errors.append(state.belief.mean[:, 9] - scene.truth[k, :, 9])
-        modes.append(state.belief.mode if isinstance(state.belief, Moded) else None)
-    return torch.stack(errors), torch.stack(modes)
+        assert isinstance(state.belief, Moded)
+        claims.append(state.belief.covariance[:, 8, 8].sqrt())
+        modes.append(state.belief.mode)
+    return torch.stack(errors), torch.stack(claims), torch.stack(modes)
 
 
 @pytest.fixture(scope="module")
@@ -478,21 +511,29 @@ def test_mission_goes_through_its_modes(mission, name):
             ("alignment", "cruise", "released from the mast, heading known to 5 deg"),
             ("cruise", "approach", "low over the landing spot"),
         ]
-        assert log[0].step == 240 and mission.truth[log[1].step, row, 9] < nav.LOW_M + 0.5
+        k = log[1].step
+        low = nav.LOW_M - mission.truth[k, row, 9]
+        # The filter takes the ship for low there; errors are as large as claimed, within 1e-6.
+        assert log[0].step == 240 and low > chi2.isf(RARE, 1) ** 0.5 * -history.covariance[k, row, 8, 8].sqrt()
     modes = history.diagnostics.mode
     assert (modes[:241] == 0).all() and (modes[241] == 1).all()
-    off = (history.mean[-1, :, 7:10] - mission.truth[-1, :, 7:10]).abs()
-    assert off[:, :2].max() < 0.3 and off[:, 2].max() < 0.6
+    assert within(history.mean[-1, :, 7:10] - mission.truth[-1, :, 7:10], history.covariance[-1], slice(6, 9))
 
 
 @pytest.mark.slow
 def test_late_readings_taken_for_new_lag_behind(mission):
-    """Sinking at 0.2 m/s with 0.2 s delay: 4 cm too high if the echo is taken for new, not if its time is known."""
+    """Sinking at 0.2 m/s with 0.2 s delay: too high by what it has sunk since if the echo is taken for new.
+
+    Echoes outweigh the beacons sixty to one in height, so that their offset is passed on whole, but for 2 %. Mean
+    errors to four standard errors of the claimed deviation, one sample a run: 6e-5 each.
+    """
     sinking = (mission.truth[..., 6] < -0.15) & (mission.truth[..., 9] < nav.LOW_M - 0.3)
-    bias = {}
-    for name in ("indirect", "indirect-late-as-new"):
-        errors, modes = delayed(mission, name)
+    steps = round(0.2 / mission.dt)
+    sunk = mission.truth[:-steps, :, 9] - mission.truth[steps:, :, 9]
+    for name, share in (("indirect", 0.0), ("indirect-late-as-new", 1.0)):
+        errors, claims, modes = delayed(mission, name)
         chosen = sinking & (modes == 2)
         assert chosen.sum() > 50
-        bias[name] = float(errors[chosen].mean())
-    assert abs(bias["indirect"]) < 0.012 and 0.02 < bias["indirect-late-as-new"] < 0.05, bias
+        bias, spread = share * sunk[chosen[steps:]].mean(), 4 * claims[chosen].mean() / len(mission.truth[0]) ** 0.5
+        assert abs(errors[chosen].mean() - bias) < spread, name
+    assert bias > spread
