@@ -153,7 +153,10 @@ def test_the_cost_of_the_loop_by_lyapunov():
 
 
 def test_a_continuous_loop_of_short_steps_costs_what_the_continuous_formula_says():
-    """The notes' 2.07484884048 as the limit of sampled designs: the excess is of second order."""
+    """The notes' 2.07484884048 as the limit of sampled designs: the excess is of second order.
+
+    With poles of at most 1.7 / s: below the cost times (1.7 dt)^2, and 4 to the next order, 1.7 (0.02 - 0.01) s.
+    """
     excess = []
     for dt in (0.02, 0.01):
         sampled = c2d(PLANT, dt, PSD, B)
@@ -168,7 +171,7 @@ def test_a_continuous_loop_of_short_steps_costs_what_the_continuous_formula_says
         within = quad_vec(spread, 0, dt)
         cost = (whole.cost.item() + np.trace(Q.numpy() @ within[0])) / dt
         excess.append(cost - 2.07484884048)
-    assert 0 < excess[1] < 1e-4 and excess[0] / excess[1] == pytest.approx(4, rel=0.01)
+    assert 0 < excess[1] < 2.075 * (1.7 * 0.01) ** 2 and excess[0] / excess[1] == pytest.approx(4, rel=0.017)
 
 
 def test_sampled_weights_by_quadrature():

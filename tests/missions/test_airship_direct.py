@@ -202,7 +202,9 @@ def test_batches_dtypes_and_compile():
     torch.testing.assert_close(transition(x[1, 2]).mean, whole.mean[1, 2], rtol=0, atol=1e-15)
     small, slope = transition.first_order(x.float(), None, STEP)
     assert small.mean.dtype == small.scale_tril.dtype == slope.dtype == torch.float32
-    torch.testing.assert_close(small.mean.double(), whole.mean, rtol=0, atol=2e-6)
+    # Numbers up to 4, some roundings each.
+    assert whole.mean.abs().max() < 4.1
+    torch.testing.assert_close(small.mean.double(), whole.mean, rtol=0, atol=4 * 4 * torch.finfo(torch.float32).eps)
     compiled = torch.compile(lambda y: transition.first_order(y, None, STEP)[1], backend="eager", fullgraph=True)
     torch.testing.assert_close(compiled(x), jacobian, rtol=0, atol=1e-15)
     mapped = torch.func.vmap(lambda y: transition(y, None, STEP).mean)(x)

@@ -88,7 +88,8 @@ def test_batches_single_precision_compile_and_training():
         torch.testing.assert_close(part.reshape(full.shape), full, rtol=0, atol=1e-13)
     single = law.first_order(x.float())
     assert single[0].mean.dtype == single[1].dtype == torch.float32
-    np.testing.assert_allclose(single[1], whole[1], atol=2e-4)
+    # Three products of up to 53 each, by rotations of a dozen roundings.
+    np.testing.assert_allclose(single[1], whole[1], atol=12 * 53 * torch.finfo(torch.float32).eps)
     compiled = torch.compile(law.first_order, fullgraph=True, backend="eager")(x)
     torch.testing.assert_close(compiled[1], whole[1])
     torch.testing.assert_close(torch.func.vmap(lambda row: law(row).mean)(x), whole[0].mean)
@@ -149,7 +150,8 @@ def test_exact_readings_give_the_iron():
     np.testing.assert_allclose(again.soft_iron, SOFT, atol=1e-12)
     single = fit_iron(readings(field, 0.0, generator).float(), 50.0)
     assert single.hard_iron.dtype == single.soft_iron_sd.dtype == torch.float32
-    np.testing.assert_allclose(single.hard_iron, HARD, atol=1e-4)
+    # The fit runs in double precision: readings up to 120 are rounded before, the answer after.
+    np.testing.assert_allclose(single.hard_iron, HARD, atol=120 * torch.finfo(torch.float32).eps)
 
 
 @pytest.mark.parametrize("least", [-1.0, 0.0])

@@ -119,7 +119,8 @@ def test_single_precision_and_compile():
     law, x = UltrasonicRange(0.02, 0.05, half_angle_rad=CONE), states(TILTS)
     single = law.first_order(x.float())
     assert single[0].mean.dtype == single[1].dtype == torch.float32
-    np.testing.assert_allclose(single[1], law.first_order(x)[1], rtol=1e-4, atol=2e-5)
+    # At most 75 degrees of tilt: h / cos^2 of 55 degrees beyond the cone is up to 6, by a dozen roundings of the turn.
+    np.testing.assert_allclose(single[1], law.first_order(x)[1], atol=12 * 6 * torch.finfo(torch.float32).eps, rtol=0)
     compiled = torch.compile(law.first_order, fullgraph=True, backend="eager")(x)
     torch.testing.assert_close(compiled[1], law.first_order(x)[1])
     torch.testing.assert_close(torch.func.vmap(lambda row: law(row).mean)(x), law(x).mean)
