@@ -70,7 +70,10 @@ def test_shapes_and_phases(short):
 
 @pytest.mark.slow
 def test_whole_mission():
-    """Still at the mast, about 1 m/s past all waypoints, never near floor, walls and ceiling, down at the spot."""
+    """Still at the mast, about 1 m/s past all waypoints, clear of floor, walls and ceiling, down at the spot.
+
+    What the scene's constants and the hull's size ask for; gusts of 0.05 m/s take nothing away from that.
+    """
     s = make_scene(AirshipSettings(runs=RUNS, seed=7))
     place, speed = s.ship[..., 7:10], torch.linalg.vector_norm(s.ship[..., 4:7], dim=-1)
     moored = s.phase == ANCHORED
@@ -81,13 +84,15 @@ def test_whole_mission():
     for waypoint in scene.WAYPOINTS_M:
         off = torch.linalg.vector_norm(place[cruise][..., :2] - torch.tensor(waypoint[:2]), dim=-1)
         nearest = off.min(0)
-        assert (nearest.values < 2.1).all()
+        assert (nearest.values < scene._REACHED_M).all()
         height = place[cruise][nearest.indices, torch.arange(RUNS), 2]
         assert (height - waypoint[2]).abs().max() < 1.0
+    hull = Airship()
     for axis, size in enumerate(scene.HALL_M):
-        assert place[..., axis].min() > 1.1 and place[..., axis].max() < size - 1.1
+        reach = hull.length_m / 2 if axis < 2 else max(hull.diameter_m / 2, -hull.gondola_height_m)
+        assert place[..., axis].min() > reach and place[..., axis].max() < size - reach
     off = torch.linalg.vector_norm(place[-1, :, :2] - torch.tensor(scene.LANDING_M), dim=-1)
-    assert off.max() < 1.5 and (place[-1, :, 2] - scene.LANDED_HEIGHT_M).abs().max() < 0.2
+    assert off.max() < scene._ABOVE_M and (place[-1, :, 2] - scene.LANDED_HEIGHT_M).abs().max() < 0.2
     # It sinks near the spot, under the sonar's ranges.
     assert ((s.truth[..., 9] < 0.9).any(0)).all() and s.measurements["ultrasonic"][-20:].isfinite().any(0).all()
 

@@ -10,6 +10,8 @@ import run_height as run_height_script
 import torch
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from scipy.stats import f as fisher
 
 from torchfilt.io.quad_baro_range import Attitude, Fixes, QuadBaroRange, read_quad_baro_range
 from torchfilt.missions.quad_height import (
@@ -136,6 +138,11 @@ def made_log(seconds=40.0, lean_rad=0.15):
     )
 
 
+# Errors of the sampling at 50 Hz: a lean of 0.06 rad/s is held for half a sample; heights up to 2.8 m are seen along
+# it; a jerk of 0.8 m (2 pi / 7 s)^3 is held over the halves of a sample at both ends of a step.
+LEAN_ERROR_RAD = 0.15 * 0.4 * 0.01
+RANGE_ERROR_M = 2.8 * np.tan(0.15) * LEAN_ERROR_RAD
+PUSH_ERROR_M_S = 0.8 * (2 * np.pi / 7) ** 3 * 0.02**2 / 4 + 9.81 * 0.25 * LEAN_ERROR_RAD**2
 MADE = HeightSettings(stop_s=38.0, settle_s=5.0, gaps_s=(4.0,), up_sd_m_s2=30.0)
 
 
@@ -146,38 +153,44 @@ def test_forces_are_turned_upright():
     at = edges[1:].numpy()
     lean = lean_at(at, 0.15)
     seen = Rotation.from_quat(quaternion.numpy()).apply([0.0, 0, 1], inverse=True)
-    # Rate and force are means over 20 ms; specific force leans with nothing here, so that tilt has no other error.
-    np.testing.assert_allclose(seen, np.stack([0 * lean, np.sin(lean), np.cos(lean)], -1), atol=2e-3)
+    # Specific force leans with nothing here, so that tilt has no other error.
+    np.testing.assert_allclose(seen, np.stack([0 * lean, np.sin(lean), np.cos(lean)], -1), atol=LEAN_ERROR_RAD)
     swing = 2 * np.pi / 7
     expected = np.diff(0.8 * swing * np.sin(swing * edges.numpy()))
-    np.testing.assert_allclose(push, expected, atol=2e-3)
+    np.testing.assert_allclose(push, expected, atol=PUSH_ERROR_M_S)
 
 
 def test_delays_are_taken_back_and_range_is_seen_from_the_tilt():
     flight = make_flight(made_log(), MADE)
     heard = flight.range_height_m.isfinite()
     true = 2 - 0.8 * torch.cos(2 * torch.pi / 7 * flight.time_s)
-    torch.testing.assert_close(flight.range_height_m[heard], true[heard], atol=2e-3, rtol=0)
+    torch.testing.assert_close(flight.range_height_m[heard], true[heard], atol=RANGE_ERROR_M, rtol=0)
     torch.testing.assert_close(
         flight.baro_m[flight.baro_m.isfinite()], true[flight.baro_m.isfinite()] + 1.5, atol=1e-6, rtol=0
     )
     late = make_flight(made_log(), replace(MADE, range_delay_s=0.0, baro_delay_s=0.0))
     heard = late.range_height_m.isfinite()
     true = 2 - 0.8 * torch.cos(2 * torch.pi / 7 * late.time_s)
-    # At 0.72 m/s and 0.24 s late.
-    assert (late.range_height_m - true)[heard].abs().max().item() == pytest.approx(0.17, abs=0.02)
+    # The chord of 0.24 s; the lean that it is seen along is late as well, by 0.06 rad/s.
+    chord, lean = 1.6 * np.sin(2 * np.pi / 7 * 0.12), 2.8 * np.tan(0.15) * 0.06 * 0.24
+    assert (late.range_height_m - true)[heard].abs().max().item() == pytest.approx(chord, abs=lean)
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_made_flight_is_followed_through_gaps(name):
-    """No noise at all: what is left is the sampling of force and tilt at 50 Hz; measured 2 mm after 4 s."""
+    """No noise at all: what is left is the sampling of force and tilt at 50 Hz.
+
+    In a gap of 4 s the errors of 16 pushes add up, of which each acts for half of it in the mean; the speed at its
+    start is wrong by how fast the lean's error comes and goes, 0.4 / s, the height by the range's.
+    """
     flight = make_flight(made_log(), MADE)
     summary = summarize(follow(name, flight, MADE), flight, MADE)
-    assert summary["gaps"]["4"]["rms_m"] < 0.005
-    assert summary["used"]["to_onboard"]["rms_m"] < 1e-3
+    most = 4 * 16 * PUSH_ERROR_M_S / 2 + 4 * 0.4 * RANGE_ERROR_M + RANGE_ERROR_M
+    assert summary["gaps"]["4"]["rms_m"] < most
+    assert summary["used"]["to_onboard"]["rms_m"] < RANGE_ERROR_M
     if name != "inertial":
-        assert summary["withheld"]["rms_m"] < 0.005
-        assert summary["drift_m"] == pytest.approx([1.5, 1.5], abs=1e-3)
+        assert summary["withheld"]["rms_m"] < most  # the barometer keeps it so for the rest
+        assert summary["drift_m"] == pytest.approx([1.5, 1.5], abs=RANGE_ERROR_M)
 
 
 def test_gaps_of_the_range_finder_and_of_the_inertial_sensors(log, short):
@@ -203,14 +216,17 @@ def test_gaps_of_the_range_finder_and_of_the_inertial_sensors(log, short):
 
 
 def test_tilt_is_near_that_of_another_filter(log, short):
-    """Measured on the whole flight: median 1.3 degrees, mostly the centripetal force of the circles."""
+    """Nearer to it than gravity's direction by the force of the moment, which each push leans, and than no tilt."""
     roll, pitch = (
         np.interp(short.time_s, log.onboard.time_s, values) for values in (log.onboard.roll_rad, log.onboard.pitch_rad)
     )
     theirs = np.stack([-np.sin(roll) * np.cos(pitch), np.sin(pitch), np.cos(roll) * np.cos(pitch)], -1)
     ours = Rotation.from_quat(short.quaternion.numpy()).apply([0.0, 0, 1], inverse=True)
-    off = np.rad2deg(np.arccos(np.clip((ours * theirs).sum(-1), -1, 1)))
-    assert np.median(off) < 2 and off.max() < 6
+    force = np.stack([np.interp(short.time_s, log.imu_time_s, axis) for axis in log.accel_m_s2.T], -1)
+    force /= np.linalg.norm(force, axis=-1, keepdims=True)
+    off, *others = (np.arccos(np.clip((up * theirs).sum(-1), -1, 1)) for up in (ours, force, np.array([[0.0, 0, 1]])))
+    for other in others:
+        assert np.median(off) < np.median(other) and off.max() < other.max()
 
 
 @pytest.mark.parametrize(
@@ -324,13 +340,16 @@ def test_numbers_are_those_of_the_definition(short):
     assert (found["log_likelihood"], found["cpu_s"]) == (-7.0, 0.5)
 
 
-def test_the_study_on_a_piece_and_again_from_its_stages(tmp_path):
+def test_the_study_on_a_piece_and_again_from_its_stages(short, tmp_path):
     lines = []
     summary = run_height(SHORT, tmp_path, say=lines.append)
     assert list(summary["filters"]) == list(FILTERS)
     for row in summary["filters"].values():
-        # On the flat first part the range finder is followed to its noise, the on-board filter to its lead.
-        assert row["used"]["to_onboard"]["rms_m"] < 0.4 and 0.5 < row["used"]["range_nis"] < 3
+        # The range finder is followed to its noise, so that the on-board filter is as far away as from the range.
+        heard = short.range_height_m.isfinite() & (short.time_s > SHORT.settle_s)
+        apart = (short.range_height_m - short.witness[:, 0])[heard].square().mean().sqrt().item()
+        assert row["used"]["to_onboard"]["rms_m"] == pytest.approx(apart, abs=3 * SHORT.range_sd_m)
+        assert row["used"]["range_nis"] > 0
         assert set(row["gaps"]) == {"2", "4"}
     assert summary["filters"]["inertial"]["used"]["baro_nis"] is None
     assert json.loads((tmp_path / "metrics.json").read_text())["filters"] == summary["filters"]
@@ -341,17 +360,38 @@ def test_the_study_on_a_piece_and_again_from_its_stages(tmp_path):
 
 @pytest.mark.slow
 def test_the_drift_in_the_state_carries_the_height_through_gaps(tmp_path):
-    """Measured rms after 60 s: 26 m without barometer, 1.1 m with a fixed offset, 0.6 m with a drifting one."""
-    found = run_height(HeightSettings(str(DATA)), tmp_path, say=lambda line: None, figures=False)["filters"]
+    """Gaps on the whole flight: rms smaller, claims honest with a drift in the state, neither with a fixed offset.
+
+    Gaps of one length overlap, so that half of their number counts as independent. 99.9 % of the ratio of two mean
+    squares, of a mean NEES; the fixed offset is refuted to 1e-6. Measured rms after 60 s: 26 m without barometer, 1.1 m
+    with a fixed offset, 0.6 m with a drifting one.
+    """
+    settings = HeightSettings(str(DATA))
+    found = run_height(settings, tmp_path, say=lambda line: None, figures=False)["filters"]
     for gap in ("10", "30", "60"):
+        fixed = found["fixed"]["gaps"][gap]
+        count = fixed["count"] // 2
+        assert fixed["nees"] > chi2.isf(1e-6, count) / count
         for name in ("walk", "wander"):
-            assert found[name]["gaps"][gap]["rms_m"] < 0.65 * found["fixed"]["gaps"][gap]["rms_m"]
-            assert found[name]["gaps"][gap]["nees"] < 1 < 5 < found["fixed"]["gaps"][gap]["nees"]
-    assert found["inertial"]["gaps"]["60"]["rms_m"] > 10
-    # Withheld for good, nothing knows the drift: it is in the error, and in the claim of `wander`.
-    assert 1 < found["wander"]["withheld"]["rms_m"] < 2.5 and found["wander"]["withheld"]["nees"] < 1.5
-    # The receiver's velocity is no witness in the circles.
-    assert found["wander"]["used"]["velocity_bias_m_s"][0] == pytest.approx(-0.28, abs=0.03)
+            part = found[name]["gaps"][gap]
+            # Of the longer gaps there are too few for a bound of their own.
+            surely = fisher.isf(1e-3, count, count) ** -0.5 if gap == "10" else 1.0
+            assert part["rms_m"] < surely * fixed["rms_m"] and part["nees"] < chi2.isf(1e-3, count) / count
+    # Forces integrated twice for a minute.
+    last = {name: found[name]["gaps"]["60"]["rms_m"] for name in ("inertial", "fixed")}
+    assert last["inertial"] > fisher.isf(1e-3, count, count) ** 0.5 * last["fixed"]
+    # Withheld for good, nothing knows the drift: it is in the claim of `wander`, one error alike for long.
+    assert found["wander"]["withheld"]["nees"] < chi2.isf(1e-3, 1)
+    # The receiver's velocity is no witness in the circles: what the range finder rose by says so without a filter.
+    flight = make_flight(read_quad_baro_range(DATA), settings)
+    part = (flight.time_s > settings.settle_s) & (flight.time_s <= settings.split_s)
+    seen = torch.nonzero(part & flight.range_height_m.isfinite())[[0, -1], 0]
+    rise = (flight.range_height_m[seen].diff() / flight.time_s[seen].diff()).item()
+    receiver, dt = flight.witness[part, 1], flight.dt_s[part]
+    # Means over steps that are not alike: four standard errors of a speed weighted by unrelated lengths.
+    spread = 4 * (receiver.std() * dt.std() / dt.mean()).item() / len(dt) ** 0.5
+    bias = found["wander"]["used"]["velocity_bias_m_s"][0]
+    assert bias == pytest.approx(rise - receiver.mean().item(), abs=spread) and bias < -5 * spread
 
 
 # Command line
