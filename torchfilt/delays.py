@@ -59,7 +59,7 @@ class Arrival(NamedTuple):
 
     @property
     def delay_s(self) -> float:
-        """How late it came."""
+        """How late it came, s."""
         return self.arrived_s - self.time_s
 
 
@@ -188,6 +188,9 @@ class DelayedMeasurements(nn.Module, Generic[B]):
             state: to go on from in place of the prior, such as ``history.final``, with its own batch and seed. What it
                 has taken in already is not known here.
 
+        Returns:
+            A `DelayedState` at ``time_s``, with nothing behind it.
+
         Raises:
             ValueError: a time that is not finite.
         """
@@ -217,6 +220,9 @@ class DelayedMeasurements(nn.Module, Generic[B]):
                 and is taken in as by `late`.
             time_s: end of the step; give it in place of dt where the clock is absolute, so that no rounding adds up.
             throw: as in ``filter.step``.
+
+        Returns:
+            The state at the end of the step, and a `DelayedInfo` of what was run for it.
 
         Raises:
             TypeError: dt or time_s is not a number. ValueError: both or neither given, time that runs backward, a
@@ -254,6 +260,9 @@ class DelayedMeasurements(nn.Module, Generic[B]):
             time_s: when it was measured.
             replace: put it in the place of what the same sensor said at the same time; otherwise that is an error.
             throw: as in ``filter.step``.
+
+        Returns:
+            The state at the same time as before, and a `DelayedInfo` with the steps that were run again.
 
         Raises:
             TypeError: time_s is not a number. ValueError: a time that is still to come, one that is too old
@@ -465,6 +474,9 @@ def save(state: DelayedState[Any], path: str | Path) -> None:
 
 def load(path: str | Path) -> DelayedState[Any]:
     """Read what `save` wrote; a stream that goes on from it gives the same bits as one that was never stopped.
+
+    Returns:
+        The state.
 
     Raises:
         FileNotFoundError: no such file.

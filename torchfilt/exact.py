@@ -36,6 +36,9 @@ def examine(rows: Tensor, residual: Tensor, present: Tensor, spread_floor: Tenso
         present: (..., k) rows that are there.
         spread_floor: (..., k) below which a row's length is rounding.
         residual_terms: (..., k) size of what the residual is the difference of.
+
+    Returns:
+        A `Verdict`.
     """
     idle = []
     for j in range(rows.shape[-2]):
@@ -67,6 +70,9 @@ def keep_true(factor: Tensor, rows: Tensor, residual: Tensor, present: Tensor, f
         rows: (..., k, e) derivatives of the exact rows.
         residual: (..., k) of rounding size, that the move takes away.
         present: (..., k) rows that hold.
+
+    Returns:
+        The factor (..., e, e), lower triangular, and the move (..., e).
     """
     scale = factor.norm(dim=-1)
     scaled = factor / torch.where(scale > 0, scale, 1).unsqueeze(-1)

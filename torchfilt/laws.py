@@ -264,6 +264,9 @@ def row_steps(dt: Tensor | float, like: Tensor) -> Tensor:
 def one_number(value: Tensor | float, name: str, *, zero: bool = False, dtype: torch.dtype = torch.float64) -> Tensor:
     """A scalar tensor of one finite number above zero, or of one that may be zero; a tensor stays what it is.
 
+    Returns:
+        The scalar tensor; of a number one of ``dtype``.
+
     Raises:
         ValueError: another number, or several; under its name.
     """
@@ -281,7 +284,11 @@ def _pushed(matrix: Tensor, u: Tensor) -> Tensor:
 
 
 def check_control(u: Tensor, matrix: Tensor) -> None:
-    """Raise a ValueError where a control (..., k) does not fit its input matrix (..., d, k)."""
+    """Refuse a control (..., k) that does not fit its input matrix (..., d, k).
+
+    Raises:
+        ValueError: another length; names it.
+    """
     if u.shape[-1:] != matrix.shape[-1:]:
         raise ValueError(f"the control must be (*batch, {matrix.shape[-1]}), got shape {tuple(u.shape)}")
 

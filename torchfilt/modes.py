@@ -133,7 +133,11 @@ class NavigationModes(Filter[Moded]):
         missing: Missing = "rows",
         predict: bool = True,
     ) -> tuple[Moded, StepInfo]:
-        """See `Filter.advance`."""
+        """A step of the filter of each row's mode, then the switches; see `Filter.advance`.
+
+        Raises:
+            ValueError: no dt.
+        """
         if dt is None:
             raise ValueError("modes count the seconds in them: the step needs its dt")
         heard = torch.where(self.allowed[belief.mode], y, torch.nan)
@@ -208,6 +212,9 @@ def switches(history: History, filter: NavigationModes) -> Iterator[Switched]:
 
     Args:
         history: of ``filter``.
+
+    Returns:
+        An iterator of `Switched`.
 
     Raises:
         ValueError: a history of a filter without modes.

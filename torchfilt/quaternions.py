@@ -135,7 +135,10 @@ def turned_by_jacobian(v: Vector, error: Vector) -> Vector:
 
 
 def turned_by_inverse_jacobian(v: Vector, error: Vector) -> Vector:
-    """The inverse of `turned_by_jacobian`, for v shorter than a turn: I - [v] / 2 + (1 - a/2 cot a/2) / a^2 [v]^2."""
+    """The inverse of `turned_by_jacobian`, for v shorter than a turn: I - [v] / 2 + (1 - a/2 cot a/2) / a^2 [v]^2.
+
+    Source: Barfoot, State Estimation for Robotics (2017), section 7.1.5.
+    """
     square = _square(v)
     small = square < 1e-2
     angle2 = torch.where(small, 1, square)

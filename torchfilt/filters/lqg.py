@@ -79,6 +79,9 @@ class LQGController(nn.Module):
             initial: the prior.
             dt: time step of a continuous system, s.
 
+        Returns:
+            The controller, its observer a `SteadyStateKalmanFilter`.
+
         Raises:
             ValueError: a continuous system without dt, or a discrete one with another; D other than zero, where a
                 control would be needed for the measurement that it is computed from; as `lqr` and `kalman`.
@@ -98,7 +101,11 @@ class LQGController(nn.Module):
         return cls(SteadyStateKalmanFilter(model, dt), lqr(c2d(plant, dt).system, *weights).gain)
 
     def init(self, batch_shape: tuple[int, ...] = (), control: Tensor | None = None, seed: int = 0) -> ControllerState:
-        """The observer's prior and the control (*batch, k) that acts before the first measurement, zero by default."""
+        """The observer's prior and the control (*batch, k) that acts before the first measurement, zero by default.
+
+        Raises:
+            ValueError: a control of another shape.
+        """
         if control is None:
             control = self.gain.new_zeros(*batch_shape, len(self.gain))
         if control.shape != (*batch_shape, len(self.gain)):
@@ -144,6 +151,9 @@ def sampled_weights(
         state_weight: Q (*batch, d, d). control_weight: R (*batch, k, k). cross: N (*batch, d, k), default zero; per
             second.
         dt: s, a number or (*batch).
+
+    Returns:
+        `SampledWeights`, of a step.
 
     Raises:
         TypeError, ValueError: weights as in `lqr`; a discrete system; dt as in `c2d`.

@@ -113,6 +113,9 @@ class LuenbergerObserver(Filter[Gaussian]):
     def stationary_covariance(self) -> Tensor:
         """Error covariance (d, d) that this gain settles to, after the measurement; by SciPy's Lyapunov solvers.
 
+        Returns:
+            (d, d), in the states' units.
+
         Raises:
             ValueError: no noise was given, or the error does not die out; the pole is named.
         """

@@ -88,6 +88,9 @@ def read_quad_baro_range(path: str | Path, *, manifest: Mapping[str, str] | str 
         path: the archive: the one of this repository or the original, or a folder that holds `ARCHIVE`.
         manifest: SHA-256 of the archive by name, or a JSON file that holds it.
 
+    Returns:
+        A `QuadBaroRange`, float64, of the times as received.
+
     Raises:
         LogError: the archive is damaged, has members that are foreign, double, encrypted or too large; a table is cut
             short or implausible; a digest differs from the manifest's. Rows are counted from 1, samples from 0.

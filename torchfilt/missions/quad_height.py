@@ -181,7 +181,11 @@ class VerticalMotion(nn.Module):
         self.wander_time_s = wander_time_s
 
     def linear_form(self, u: Tensor | None = None, dt: Step = None) -> LinearForm:
-        """Matrix, push and noise factor of a step of dt s: numbers, or (..., 1)."""
+        """Matrix, push and noise factor of a step of dt s: numbers, or (..., 1).
+
+        Raises:
+            ValueError: no control of two numbers, or no dt.
+        """
         if u is None or u.shape[-1] != 2:
             raise ValueError(f"this law needs a control u (..., 2), got {'none' if u is None else tuple(u.shape)}")
         if dt is None:
@@ -230,6 +234,9 @@ def _rows(rows: list[list[Tensor]]) -> Tensor:
 
 def make_flight(log: QuadBaroRange, settings: HeightSettings) -> Flight:
     """Steps of the flight with their upright forces, and the range finder withheld.
+
+    Returns:
+        A `Flight`.
 
     Raises:
         ValueError: a part of the flight outside the log.
@@ -346,6 +353,9 @@ def _gaps(stamp: Tensor, settings: HeightSettings) -> tuple[Tensor, list[tuple[i
 
 def make_filter(name: str, flight: Flight, settings: HeightSettings) -> Any:
     """A filter that starts at rest at the first range, its barometer set to it; sensors ``range`` and ``baro``.
+
+    Returns:
+        A Kalman filter, float64.
 
     Raises:
         ValueError: unknown name.

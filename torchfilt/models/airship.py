@@ -119,7 +119,7 @@ class Airship:
 
     @property
     def volume_m3(self) -> float:
-        """Of the hull."""
+        """Volume of the hull."""
         return math.pi / 6 * self.length_m * self.diameter_m**2
 
     @property
@@ -129,12 +129,12 @@ class Airship:
 
     @property
     def mass_kg(self) -> float:
-        """Skin, gas and gondola."""
+        """Mass of skin, gas and gondola."""
         return self.displaced_mass_kg + self.heaviness_kg
 
     @property
     def skin_mass_kg(self) -> float:
-        """What is left for the skin."""
+        """Mass that is left for the skin."""
         return self.mass_kg - self.gondola_mass_kg - self.gas_density_kg_m3 * self.volume_m3
 
     @property
@@ -144,14 +144,14 @@ class Airship:
 
     @property
     def added_mass_kg(self) -> tuple[float, float, float]:
-        """Right, forward, up."""
+        """Added masses right, forward, up, body axes."""
         along, across, _ = lamb_factors(self.length_m / self.diameter_m)
         side = across * self.displaced_mass_kg
         return side, along * self.displaced_mass_kg, side
 
     @property
     def inertia_kg_m2(self) -> tuple[float, float, float]:
-        """About the hull's centre and body axes.
+        """Moments of inertia about the hull's centre and body axes.
 
         The gas turns with the hull, as a solid; the skin is the space between two similar ellipsoids; the gondola is a
         point.
@@ -164,7 +164,7 @@ class Airship:
 
     @property
     def added_inertia_kg_m2(self) -> tuple[float, float, float]:
-        """About the hull's centre and body axes; none about the long axis."""
+        """Added moments of inertia about the hull's centre and body axes; none about the long axis."""
         _, _, turn = lamb_factors(self.length_m / self.diameter_m)
         air = self.displaced_mass_kg / 20 * (self.length_m**2 + self.diameter_m**2)
         return turn * air, 0.0, turn * air
@@ -267,6 +267,9 @@ class AirshipTransition(nn.Module):
                 what the air does.
             air_velocity: (..., 3), m/s, world axes.
             dt: number or (..., 1), s.
+
+        Returns:
+            The state (..., 13).
         """
         end = rk4(lambda _, y: self.rates(y, wrench, air_velocity), x, dt, self.steps)
         q = end[..., :4]
@@ -339,7 +342,7 @@ class AirshipTransition(nn.Module):
 
 
 def inertia_matrix(airship: Airship) -> Tensor:
-    """Mass and inertia of airship and moved air (6, 6), by velocity and rate in body axes at the hull's centre."""
+    """Mass and inertia (6, 6), SI, of airship and moved air, by velocity and rate in body axes at the hull's centre."""
     arm = torch.tensor([0.0, 0.0, airship.gravity_centre_height_m], dtype=torch.float64)
     offset = airship.mass_kg * skew(arm)
     mass = airship.mass_kg + torch.tensor(airship.added_mass_kg, dtype=torch.float64)

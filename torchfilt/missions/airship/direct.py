@@ -80,7 +80,7 @@ class DirectTransition(nn.Module):
         hold(self, "densities", torch.tensor([rate, push, *walks], dtype=torch.float64))
 
     def forward(self, x: Tensor, u: Tensor | None = None, dt: Step = None) -> Gaussian:
-        """Law of the state a step later."""
+        """Law of the state (..., 22) a step later."""
         return self._law(x, self._move(x, dt))
 
     def first_order(self, x: Tensor, u: Tensor | None = None, dt: Step = None) -> tuple[Gaussian, Tensor]:
@@ -196,6 +196,9 @@ def to_rates(controls: Tensor, dt: float) -> Tensor:
     """Compensated increments (dtheta, dv) (..., 6) as mean rate and mean specific force in the axes of the middle.
 
     dv is told in the axes at the start, half a turn before the middle.
+
+    Returns:
+        (..., 6): rad/s and m/s^2, body axes.
     """
     dtheta, dv = controls.split(3, -1)
     return torch.cat([dtheta, rotate(from_rotation_vector(-dtheta / 2), dv)], -1) / dt

@@ -15,7 +15,13 @@ _MODE_COLOURS = (COLOURS[2], COLOURS[0], COLOURS[1])
 
 
 def airship_figures(results: dict[str, Arrays], scene: Scene, folder: Path) -> list[Path]:
-    """Draw them; returns the files. The first filter is the one that is shown alone, of the first run."""
+    """Draw the study's figures into a folder, as PNG files; needs matplotlib.
+
+    The first filter is the one that is shown alone, of the first run.
+
+    Returns:
+        The files.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     first = next(iter(results.values()))
     drawn = [_mission(first, scene, folder / "mission.png"), _errors(first, scene, folder / "errors.png")]

@@ -119,6 +119,9 @@ def make_model(scene: Scene, variant: Variant) -> StateSpaceModel:
 
     Sensors: "mast" (position and velocity, 6, where it is moored), "barometer", "compass" (the magnetometer at the
     mast, counted wide), "magnetometer", "beacons", "ultrasonic", and for the direct form "imu".
+
+    Returns:
+        The model of a state of `INDIRECT` or `DIRECT`'s layout, its prior a batch of the scene's runs (R,).
     """
     settings, layout = scene.settings, DIRECT if variant.direct else INDIRECT
     transition = WithAltimeter(
@@ -191,7 +194,7 @@ class _Mooring(nn.Module):
 
 
 def moored() -> Tensor:
-    """What the mast says (6,): where the gondola hangs, and that it is at rest."""
+    """What the mast says (6,), m and m/s, local frame: where the gondola hangs, and that it is at rest."""
     return torch.tensor([*MAST_M[:2], MAST_M[2] + Airship().gondola_height_m, 0, 0, 0], dtype=torch.float64)
 
 
@@ -235,6 +238,9 @@ def readings(scene: Scene, variant: Variant) -> dict[str, Tensor]:
 
     The sonar's readings are of some steps before; `late_readings` has them, unless the variant takes them for new.
     Clamped ones are left out. The mast speaks as long as the ship hangs there.
+
+    Returns:
+        By the sensor's name, in the unit of the scene's measurements; NaN where it says nothing.
     """
     at_mast = scene.phase == 0
     runs = scene.truth.shape[1]
@@ -250,7 +256,7 @@ def readings(scene: Scene, variant: Variant) -> dict[str, Tensor]:
 
 
 def late_readings(scene: Scene) -> tuple[Tensor, int]:
-    """The sonar's readings (t, R, 1) by the step at which they come, and how many steps they are late."""
+    """The sonar's readings (t, R, 1), m, by the step at which they come, and how many steps they are late."""
     law = ultrasonic_law(scene.settings)
     return law.measured(scene.measurements["ultrasonic"]), round(law.delay_s * FILTER_RATE_HZ)
 
@@ -308,6 +314,9 @@ def _sensors(mode: str, variant: Variant) -> tuple[str, ...]:
 
 def make_filter(name: str, scene: Scene) -> Filter[Any]:
     """The filter called ``name``, one of `FILTERS`.
+
+    Returns:
+        A `NavigationModes`, or a `GaussianFilter` for a variant without modes.
 
     Raises:
         ValueError: unknown name.

@@ -150,11 +150,11 @@ class AirshipSettings:
 
     @property
     def steps(self) -> int:
-        """Of the filter."""
+        """Number of steps of the filter."""
         return round((self.anchored_s + self.cruise_s + self.approach_s) * FILTER_RATE_HZ)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """All settings as numbers and dicts, JSON-ready."""
         return asdict(self)
 
 
@@ -185,7 +185,11 @@ class Scene(NamedTuple):
 
 
 def make_scene(settings: AirshipSettings) -> Scene:
-    """Fly and measure; each run's numbers depend on its own seed alone."""
+    """Fly and measure; each run's numbers depend on its own seed alone.
+
+    Returns:
+        A `Scene`.
+    """
     seeds = [settings.seed + k for k in range(settings.runs)]
     dt = 1 / FILTER_RATE_HZ
     first, flown, thrust, air = _fly(settings, seeds)
@@ -378,7 +382,7 @@ def field_ut(settings: AirshipSettings, position: Tensor) -> Tensor:
 
 
 def clutter_m(settings: AirshipSettings, position: Tensor) -> Tensor:
-    """Height (...) of what stands on the floor below positions (..., 3): tables of 4 m by 3 m, like a chessboard."""
+    """Height (...), m, of what stands below positions (..., 3), m: tables of 4 m by 3 m, like a chessboard."""
     across, along = (position[..., k] / size for k, size in ((0, 4.0), (1, 3.0)))
     table = (across.floor() + along.floor()) % 2 == 0
     clear = [

@@ -127,6 +127,9 @@ def compare(scene: Scene, belief: Gaussian | Particles, truth: Tensor) -> tuple[
 
     Args:
         scene: of the runs. belief: of any filter. truth: (R, d) at heading zero.
+
+    Returns:
+        Mean, error and NEES, in the state's units.
     """
     gauge = scene.model.gauge
     assert gauge is not None

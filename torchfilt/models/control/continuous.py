@@ -160,7 +160,11 @@ class ContinuousLinear(nn.Module):
         return transition, push if self.b is not None else None, noise_factor(a, columns, step)
 
     def linear_form(self, u: Tensor | None = None, dt: Step = None) -> LinearForm:
-        """The matrices over dt, a number or (*lead, 1), s; u (..., k) enters the offset."""
+        """The matrices over dt, a number or (*lead, 1), s; u (..., k) enters the offset.
+
+        Raises:
+            ValueError: a control without b, or b without a control.
+        """
         if u is not None and self.b is None:
             raise ValueError(f"a control u {tuple(u.shape)} was given, but this law has no b")
         transition, push, factor = self.matrices(_needs_step(dt))
@@ -254,6 +258,12 @@ class ContinuousTransition(nn.Module):
             x: (..., d).
             u: control (..., k) or None.
             dt: number or (..., 1), s.
+
+        Returns:
+            The law, and Phi: the derivative of the mean by x.
+
+        Raises:
+            ValueError: noise of another size than the state.
         """
         half = _needs_step(dt) / (2 * self.steps)
         columns, d = self.noise(), x.shape[-1]
@@ -327,6 +337,9 @@ def linear_model(
             is the covariance R / dt.
         initial: the prior.
         noise_input: F (d, w); None: the identity.
+
+    Returns:
+        A `StateSpaceModel` with the systems' batch.
     """
     plant = as_system(system)
     noise = state_noise(plant.a, process_noise, noise_input, "process_noise")

@@ -186,6 +186,9 @@ def kalman(
         process_noise: Q (*batch, w, w). measurement_noise: R (*batch, m, m). noise_input: F (*batch, d, w), default
             the identity.
 
+    Returns:
+        `KalmanDesign`, in the dtype and on the device of the system, without gradients.
+
     Raises:
         TypeError: a dtype other than the system's.
         ValueError: Q not positive semidefinite, R not positive definite, shapes that do not fit; a mode that does not
@@ -220,6 +223,9 @@ def lqr(system: Any, state_weight: Tensor, control_weight: Tensor, cross: Tensor
         system: `StateSpace` or ``control.StateSpace``; its outputs play no part (``ss(a, b)`` will do).
         state_weight: Q (*batch, d, d). control_weight: R (*batch, k, k). cross: N (*batch, d, k), default zero.
 
+    Returns:
+        `Regulator`, in the dtype and on the device of the system, without gradients.
+
     Raises:
         TypeError: a dtype other than the system's.
         ValueError: R not positive definite, [[Q, N], [Nᵀ, R]] not positive semidefinite, shapes that do not fit; a mode
@@ -243,6 +249,9 @@ def lqr(system: Any, state_weight: Tensor, control_weight: Tensor, cross: Tensor
 
 def check_weights(plant: StateSpace, state_weight: Tensor, control_weight: Tensor, cross: Tensor | None) -> Tensor:
     """The cross weight, zeros for None.
+
+    Returns:
+        N (*batch, d, k).
 
     Raises:
         TypeError, ValueError: as `lqr`, for the weights alone.

@@ -53,6 +53,9 @@ def empirical_gramian(
         steps: t, where there are no controls.
         predict_first: as in the filters' call: each step moves and then measures; False leaves the first motion out.
 
+    Returns:
+        `Empirical`.
+
     Raises:
         TypeError: no model, no tensor, dtypes. ValueError: shapes, NaN, a scale or time step out of range, controls and
             steps that disagree, a measurement without noise, a run that leaves what is finite.

@@ -87,6 +87,9 @@ def rank(matrix: Tensor, tolerance: float | None = None, scale: Scale = None) ->
         scale: sizes (n,) that the columns' states have, so that a column is multiplied by its own (an attitude of
             0.01 rad then weighs as much as a position of 10 m); "columns" divides each column by its length.
 
+    Returns:
+        `Rank`.
+
     Raises:
         TypeError: not a floating-point tensor. ValueError: shape, NaN, a negative tolerance, scales that are not n
             positive numbers.
@@ -100,7 +103,11 @@ def rank(matrix: Tensor, tolerance: float | None = None, scale: Scale = None) ->
 
 
 def scale_columns(matrix: Tensor, scale: Scale) -> Tensor:
-    """The matrix (*batch, m, n) with its columns scaled, see `rank`; a column of zeros stays one."""
+    """The matrix (*batch, m, n) with its columns scaled, see `rank`; a column of zeros stays one.
+
+    Raises:
+        TypeError, ValueError: as `rank`, but for the tolerance.
+    """
     if not isinstance(matrix, Tensor) or not matrix.is_floating_point():
         raise TypeError(
             f"matrix must be a floating-point tensor, got {getattr(matrix, 'dtype', type(matrix).__name__)}"
@@ -121,7 +128,11 @@ def scale_columns(matrix: Tensor, scale: Scale) -> Tensor:
 
 
 def zero_below(matrix: Tensor, values: Tensor, tolerance: float | None) -> Tensor:
-    """Limit (*batch) up to which singular values (*batch, k) of a matrix count as zero, see `rank`."""
+    """Limit (*batch) up to which singular values (*batch, k) of a matrix count as zero, see `rank`.
+
+    Raises:
+        ValueError: a tolerance that is negative or not finite.
+    """
     if tolerance is None:
         return max(matrix.shape[-2:]) * torch.finfo(matrix.dtype).eps * values[..., 0]
     if not 0 <= tolerance < math.inf:
@@ -259,6 +270,9 @@ def pbh(a: Any, c: Tensor | None = None, *, discrete: bool = False, tolerance: f
         tolerance: default sqrt(eps) times the norm of [a; c]: far above d * eps, because rounding moves a k-fold
             eigenvalue by as much as the k-th root of eps, and a mode is tested at its computed eigenvalue.
 
+    Returns:
+        `Modes`.
+
     Raises:
         TypeError, ValueError: as `obsv`; a negative tolerance.
 
@@ -296,7 +310,11 @@ def _in_steps(a: Any, other: Tensor | None, discrete: bool) -> bool:
 
 
 def check_pair(a: Any, other: Tensor | None, name: Literal["b", "c"]) -> Pair:
-    """The two matrices, checked; ``other`` None takes both from the system a."""
+    """The two matrices, checked; ``other`` None takes both from the system a.
+
+    Raises:
+        TypeError: no floating-point tensors, or of two dtypes. ValueError: shapes that do not fit, NaN.
+    """
     if other is None:
         system = as_system(a)
         a, other = system.a, getattr(system, name)

@@ -77,6 +77,9 @@ def observability_report(
         scale, tolerance: as in `rank`. A share compares states of different units, so it needs a scale: sizes of the
             states are the honest one.
 
+    Returns:
+        `ObservabilityReport`.
+
     Raises:
         TypeError: as `rank`. ValueError: as `rank`, a batch, names that are not d different ones.
     """

@@ -92,6 +92,9 @@ def ss(a: Any, b: Any = None, c: Any = None, d: Any = None, dt: float | Tensor |
         b: (*batch, d, k). c: (*batch, m, d), default the identity: the state itself comes out. d: (*batch, m, k),
             default zero. dt: period in s; None or 0 for continuous time.
 
+    Returns:
+        `StateSpace`.
+
     Raises:
         TypeError: one argument that is no system, more arguments beside a system, dtypes that differ.
         ValueError: see `StateSpace`; dt=True, python-control's word for a period that nobody knows.
@@ -236,6 +239,9 @@ def c2d(
         dt: period in s, a number or (*batch).
         noise_psd: (*batch, w, w) power spectral density Q of white noise in dx/dt = A x + B u + F w.
         noise_input: F (*batch, d, w), default the identity.
+
+    Returns:
+        `Discretized`.
 
     Raises:
         ValueError: a system that is discrete already, a period that is not positive, a density that is not positive
@@ -425,7 +431,11 @@ def _period(dt: Any) -> Any:
 
 
 def check_period(dt: float | Tensor, like: Tensor) -> None:
-    """Refuse what is no positive finite period, a number or a tensor (*batch) of the dtype of ``like``."""
+    """Refuse what is no positive finite period, a number or a tensor (*batch) of the dtype of ``like``.
+
+    Raises:
+        TypeError: another dtype. ValueError: a period that is not positive and finite.
+    """
     values = torch.as_tensor(dt, dtype=None if isinstance(dt, Tensor) else like.dtype).detach()
     if isinstance(dt, Tensor) and dt.dtype != like.dtype:
         raise TypeError(f"dt must have the dtype of a, {like.dtype}, got {dt.dtype}")
@@ -436,7 +446,12 @@ def check_period(dt: float | Tensor, like: Tensor) -> None:
 
 
 def check_matrix(matrix: Any, name: str, like: Tensor) -> None:
-    """Refuse what is no finite matrix (*batch, rows, columns) of the dtype of ``like``, under its name."""
+    """Refuse what is no finite matrix (*batch, rows, columns) of the dtype of ``like``, under its name.
+
+    Raises:
+        TypeError: no floating-point tensor, or another dtype. ValueError: another shape, a number that is not
+        finite.
+    """
     if not isinstance(matrix, Tensor) or not matrix.is_floating_point():
         kind = matrix.dtype if isinstance(matrix, Tensor) else type(matrix).__name__
         raise TypeError(f"{name} must be a floating-point tensor, got {kind}")

@@ -45,7 +45,7 @@ HIGHEST_PRESSURE_PA = SEA_LEVEL_PRESSURE_PA * (1 + 6.5e-3 * 5000 / SEA_LEVEL_TEM
 
 
 def temperature_k(height_m: Tensor, *, check: bool = True) -> Tensor:
-    """Temperature (...) at geopotential heights (...).
+    """Temperature (...), K, at geopotential heights (...), m.
 
     Args:
         height_m: geopotential height. check: False where the values must not be looked at, as in a filter's step; the
@@ -59,7 +59,7 @@ def temperature_k(height_m: Tensor, *, check: bool = True) -> Tensor:
 
 
 def pressure_pa(height_m: Tensor, *, check: bool = True) -> Tensor:
-    """Pressure (...) at geopotential heights (...); arguments and errors as in `temperature_k`.
+    """Pressure (...), Pa, at geopotential heights (...), m; arguments and errors as in `temperature_k`.
 
     In float32 a pressure near the ground is known to 0.008 Pa, which is 0.7 mm of height.
     """
@@ -69,12 +69,12 @@ def pressure_pa(height_m: Tensor, *, check: bool = True) -> Tensor:
 
 
 def density_kg_m3(height_m: Tensor, *, check: bool = True) -> Tensor:
-    """Density of air (...) at geopotential heights (...); arguments and errors as in `temperature_k`."""
+    """Density of air (...), kg/m^3, at geopotential heights (...), m; arguments and errors as in `temperature_k`."""
     return pressure_pa(height_m, check=check) / (GAS_CONSTANT_J_KG_K * temperature_k(height_m, check=False))
 
 
 def height_m(pressure_pa: Tensor, *, check: bool = True) -> Tensor:
-    """Geopotential height (...) at which the atmosphere has pressures (...): the inverse of `pressure_pa`.
+    """Geopotential height (...), m, at which the atmosphere has pressures (...), Pa: the inverse of `pressure_pa`.
 
     Args:
         pressure_pa: pressure. check: as in `temperature_k`.

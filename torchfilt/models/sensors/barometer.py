@@ -41,6 +41,9 @@ def lag_weights(dt: Tensor | float, time_constant_s: float) -> LagWeights:
     Args:
         dt: time step, number or tensor of any shape, >= 0. time_constant_s: T.
 
+    Returns:
+        `LagWeights`.
+
     Raises:
         ValueError: a time constant that is not positive and finite.
 

@@ -56,6 +56,9 @@ class AllanParameters:
         that rises to 0.437 density sqrt(time) at 1.89 times its time and is flat around there: this puts the peak at
         the flicker noise's level. For laws that take a bias time, such as `torchfilt.models.attitude.GyroTransition`.
 
+        Returns:
+            As ``walk``.
+
         Raises:
             ValueError: a time that is not positive and finite.
         """
@@ -81,7 +84,7 @@ class ImuNoise:
         self.grade()
 
     def grade(self) -> ImuGrade:
-        """What stays when biases do not walk."""
+        """An `ImuGrade`: what stays when biases do not walk."""
         return ImuGrade(self.gyro_bias_sd_rad_s, self.gyro.white, self.accel_bias_sd_m_s2, self.accel.white)
 
     def densities(self) -> dict[str, float]:
@@ -124,6 +127,9 @@ def random_walk(start: Tensor, density: float, interval_s: float, noise: Tensor)
     Args:
         start: (..., 3). noise: standard normals (t, ..., 3); the last of them is not used.
 
+    Returns:
+        (t, ..., 3), in the unit of ``start``.
+
     Raises:
         ValueError: an interval that is not positive.
     """
@@ -143,6 +149,9 @@ def simulate_imu(
         imu: gives the densities; flicker noise is not simulated.
         noise: standard normals (t, *batch, 12): white noise, then steps of the biases, gyros first.
         start: standard normals (*batch, 6), of the biases at the start, gyros first.
+
+    Returns:
+        `SensedMotion`: rad, m/s, and biases in rad/s and m/s^2.
 
     Raises:
         ValueError: an interval that is not positive, noise without 12 numbers.
@@ -200,6 +209,9 @@ def fit_allan(averaging_s: Tensor, deviation: Tensor, *, instability: bool = Tru
     Args:
         averaging_s: (n,), n >= 3, positive. deviation: (n,), positive.
         instability: False for a series without flicker noise, such as a simulated one: B is zero.
+
+    Returns:
+        `AllanParameters`.
 
     Raises:
         ValueError: shapes, or numbers that are not positive and finite.
