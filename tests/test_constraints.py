@@ -240,13 +240,17 @@ def test_a_wide_prior_and_a_long_way_leave_no_rounding_behind(name, motion, dtyp
     late = slice(20, None)  # the oracle's covariance form itself loses half the digits at first
     error = np.abs(history.mean[late].double().numpy() - found.mean[late] @ t.T)[:, known]
     scale = np.sqrt(found.covariance[late, 0, 0].min())
-    assert error.max() < (1e-4 if dtype == DOUBLE else 0.2) * scale
+    # In deviations of what is known: one rounding of the prior's size, and what the oracle's covariance form loses.
+    eps = torch.finfo(dtype).eps
+    limit = eps * wide / scale + np.finfo(float).eps * (wide / sd) ** 2
+    assert error.max() < limit * scale
     first = scipy.stats.norm(start[0] - start[1], np.sqrt(2) * wide).logpdf(0)
     total = found.log_likelihood[1:].sum()
-    np.testing.assert_allclose(history.diagnostics.log_likelihood[1:].double().sum(), total, rtol=1e-3)
+    np.testing.assert_allclose(history.diagnostics.log_likelihood[1:].double().sum(), total, rtol=limit)
     expected = first + found.log_likelihood[0]
-    np.testing.assert_allclose(history.diagnostics.log_likelihood[0], expected, rtol=1e-4)
-    assert (history.mean[..., 0] - history.mean[..., 1]).abs()[late].max() <= 4 * torch.finfo(dtype).eps
+    # Sums of some ten terms of its own size.
+    np.testing.assert_allclose(history.diagnostics.log_likelihood[0], expected, rtol=16 * eps)
+    assert (history.mean[..., 0] - history.mean[..., 1]).abs()[late].max() <= 4 * eps
 
 
 def test_a_soft_one_may_hold_already():
