@@ -397,7 +397,6 @@ def test_a_space_that_only_the_call_shows():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*_prims_common.check.*:FutureWarning")
 def test_compiled_law_equals_eager():
     torch._dynamo.reset()
     sensors = trio()

@@ -603,7 +603,6 @@ def test_resample_move_filter_is_its_parts():
         tf.ResampleMoveParticleFilter(model, 60, window=3, kernel=kernel)
 
 
-@pytest.mark.filterwarnings("ignore:.*_prims_common.check.*:FutureWarning")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MOVES)
 def test_compiled_step_equals_eager_once_the_window_is_full(name):

@@ -28,7 +28,6 @@ def inputs(rows=3, seed=0):
 
 @pytest.mark.slow
 # The compiler of torch 2.13 calls what torch 2.13 deprecates.
-@pytest.mark.filterwarnings("ignore:.*torch._prims_common.check.* is deprecated:FutureWarning")
 @pytest.mark.parametrize(
     ("rule", "form", "missing"),
     [

@@ -368,7 +368,6 @@ def test_vmap_over_the_step_is_the_batch():
         close(one, two, 1e-12)
 
 
-@pytest.mark.filterwarnings("ignore:.*_prims_common.check.*:FutureWarning")
 @pytest.mark.slow
 def test_compiled_step_equals_eager():
     torch._dynamo.reset()

@@ -19,7 +19,6 @@ FILTERS = {
 
 
 # The compiler itself uses a name that its own package deprecates.
-@pytest.mark.filterwarnings("ignore:.*_prims_common.check.*:FutureWarning")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_compiled_step_equals_eager(name):

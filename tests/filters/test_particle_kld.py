@@ -263,7 +263,6 @@ def test_never_resampling_keeps_the_number():
 
 
 # The compiler itself uses a name that its own package deprecates.
-@pytest.mark.filterwarnings("ignore:.*_prims_common.check.*:FutureWarning")
 @pytest.mark.slow
 @pytest.mark.parametrize("resampler", [VARIED, ess_below(0.6, VARIED)], ids=["always", "adaptive"])
 def test_compiled_steps_keep_the_maximum_and_the_numbers(resampler):

@@ -422,7 +422,6 @@ def test_streams_have_the_bits_of_the_series(dtype):
 
 
 # The compiler itself uses a name that its own package deprecates.
-@pytest.mark.filterwarnings("ignore:.*_prims_common.check.*:FutureWarning")
 @pytest.mark.slow
 @pytest.mark.parametrize("shared", [True, False])
 def test_compiled_step_equals_eager(shared):

@@ -283,7 +283,6 @@ def test_single_precision(name):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*_prims_common.check.*:FutureWarning")
 @pytest.mark.parametrize("name", ["extended", "bootstrap", "bank"])
 def test_compiled_step_equals_eager(name):
     """One graph, with rows that miss different sensors; tolerance as in the other tests of compiled steps."""
