@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import expm, solve_discrete_are
 
 import torchfilt as tf
 from torchfilt.filters.observer import LuenbergerObserver, SteadyStateKalmanFilter
