@@ -15,14 +15,14 @@ python 3.11.7, torch 2.13.0+cpu, torchfilt 0.1.0
 
                             ms a step  of 25 ms
 --------------------------  ---------  --------
-ukf                              2.26     0.090
-llpf-50                          3.13     0.125
+ukf                              2.12     0.085
+llpf-50                          2.82     0.113
 two factorisations of 50         0.31     0.012
-llpf-200                         6.17     0.247
-llpf-200 compiled                4.88     0.195
-two factorisations of 200        1.29     0.052
-llpf-1000                       31.03     1.241
-two factorisations of 1000       7.29     0.292
+llpf-200                         5.04     0.202
+llpf-200 compiled                3.50     0.140
+two factorisations of 200        1.19     0.048
+llpf-1000                       26.94     1.078
+two factorisations of 1000       6.33     0.253
 -- end of the last result --
 """
 

@@ -16,14 +16,14 @@ ns a series and step (ratio to torchfilt Kalman, which shares one covariance bet
 
                                             1 series    10,000 series
 ------------------------------------  --------------  ---------------
-torchfilt Kalman                      172,326 (1.00)        74 (1.00)
-torchfilt Kalman, a covariance a row  193,860 (1.12)    1,803 (24.44)
-torchfilt steady state                 80,160 (0.47)        69 (0.93)
-torchfilt Luenberger                   39,858 (0.23)        46 (0.62)
-torchfilt Luenberger, its covariance  170,372 (0.99)        76 (1.02)
-filterpy                               17,316 (0.10)  16,400 (222.28)
-NumPy loop, Kalman                     15,718 (0.09)        19 (0.26)
-NumPy loop, constant gain               3,285 (0.02)        17 (0.23)
+torchfilt Kalman                      140,764 (1.00)        68 (1.00)
+torchfilt Kalman, a covariance a row  158,910 (1.13)    1,630 (24.02)
+torchfilt steady state                 65,691 (0.47)        62 (0.92)
+torchfilt Luenberger                   34,063 (0.24)        43 (0.64)
+torchfilt Luenberger, its covariance  135,158 (0.96)        62 (0.91)
+filterpy                               15,795 (0.11)  15,040 (221.67)
+NumPy loop, Kalman                     14,188 (0.10)        17 (0.25)
+NumPy loop, constant gain               3,117 (0.02)        16 (0.23)
 
 filterpy ran over at most 3 series, scaled.
 -- end of the last result --
