@@ -17,17 +17,17 @@ bare loop with torch's own normals and with torchfilt's):
 
                                                 n = 500           n = 2,000        n = 10,000         8 x 2,000
 -----------------------------------  ------------------  ------------------  ----------------  ----------------
-sir torchfilt                        2,296 (1.52, 1.47)    804 (1.44, 1.50)  370 (1.22, 1.42)  398 (1.24, 1.39)
-sir torchfilt, covariance too        2,621 (1.73, 1.67)    983 (1.76, 1.84)  461 (1.52, 1.77)  487 (1.51, 1.70)
-sir bare torch                       1,514 (1.00, 0.97)    557 (1.00, 1.04)  303 (1.00, 1.16)  321 (1.00, 1.12)
-sir bare torch, torchfilt's normals  1,567 (1.04, 1.00)    534 (0.96, 1.00)  261 (0.86, 1.00)  287 (0.89, 1.00)
-rpf torchfilt                        3,578 (1.66, 1.66)  1,281 (1.33, 1.54)  828 (1.17, 1.47)  728 (1.09, 1.37)
-rpf torchfilt, covariance too        3,659 (1.70, 1.70)  1,436 (1.49, 1.73)  922 (1.30, 1.63)  810 (1.21, 1.52)
-rpf bare torch                       2,157 (1.00, 1.00)    963 (1.00, 1.16)  709 (1.00, 1.26)  670 (1.00, 1.26)
-rpf bare torch, torchfilt's normals  2,154 (1.00, 1.00)    832 (0.86, 1.00)  564 (0.80, 1.00)  533 (0.80, 1.00)
+sir torchfilt                        2,158 (1.52, 1.48)    691 (1.39, 1.43)  294 (1.17, 1.40)  299 (1.16, 1.38)
+sir torchfilt, covariance too        2,328 (1.64, 1.60)    800 (1.61, 1.66)  364 (1.45, 1.74)  381 (1.48, 1.76)
+sir bare torch                       1,417 (1.00, 0.97)    497 (1.00, 1.03)  252 (1.00, 1.20)  257 (1.00, 1.19)
+sir bare torch, torchfilt's normals  1,454 (1.03, 1.00)    482 (0.97, 1.00)  210 (0.83, 1.00)  216 (0.84, 1.00)
+rpf torchfilt                        3,184 (1.59, 1.58)  1,111 (1.30, 1.48)  671 (1.12, 1.45)  637 (1.07, 1.38)
+rpf torchfilt, covariance too        3,232 (1.62, 1.60)  1,176 (1.38, 1.57)  713 (1.19, 1.54)  701 (1.18, 1.52)
+rpf bare torch                       2,000 (1.00, 0.99)    853 (1.00, 1.14)  597 (1.00, 1.29)  594 (1.00, 1.29)
+rpf bare torch, torchfilt's normals  2,018 (1.01, 1.00)    748 (0.88, 1.00)  464 (0.78, 1.00)  460 (0.77, 1.00)
 
-A step of 8 x 2,000 sir particles takes 6.4 ms.
-A step of 8 x 2,000 rpf particles takes 11.7 ms.
+A step of 8 x 2,000 sir particles takes 4.8 ms.
+A step of 8 x 2,000 rpf particles takes 10.2 ms.
 ATen calls a step (views), sir: torchfilt 574 (79), bare torch 467 (64).
 ATen calls a step (views), rpf: torchfilt 742 (132), bare torch 543 (79).
 
@@ -36,19 +36,19 @@ window of 5. ms a step of all runs:
 
                 ms
 -----------  -----
-es-kf          1.7
-es-kf-gated    1.7
-es-kf-open     2.0
-ckf            1.7
-bank-36        6.3
-sir            6.1
-rpf-plain     11.0
-rpf           11.7
-mpf           24.0
-mpf-window    32.8
-mpf-literal   47.9
-rbpf         177.3
-rbpf-shared    8.2
+es-kf          1.9
+es-kf-gated    2.1
+es-kf-open     2.1
+ckf            1.8
+bank-36        4.6
+sir            4.4
+rpf-plain      8.7
+rpf           10.0
+mpf           20.2
+mpf-window    26.8
+mpf-literal   42.1
+rbpf         158.9
+rbpf-shared    6.4
 -- end of the last result --
 """
 
