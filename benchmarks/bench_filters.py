@@ -15,18 +15,18 @@ ns a particle and step (ratio to the bare in-place loop of the same precision, o
 
                                           n = 1e3     n = 1e4     n = 1e5
 -------------------------------------  ----------  ----------  ----------
-f32 torchfilt                          173 (2.94)   44 (1.66)   33 (1.40)
-f32 torchfilt, covariance too          193 (3.30)   51 (1.94)   43 (1.83)
+f32 torchfilt                          192 (3.25)   45 (1.71)   31 (1.34)
+f32 torchfilt, covariance too          210 (3.56)   51 (1.97)   37 (1.60)
 f32 bare torch, in place                59 (1.00)   26 (1.00)   23 (1.00)
-f32 bare torch, naive                  143 (2.44)  101 (3.82)   99 (4.25)
-f64 torchfilt, fast normals            188 (2.53)   63 (1.55)   64 (1.51)
-f64 bare torch, in place, f32 normals   74 (1.00)   41 (1.00)   42 (1.00)
-f64 torchfilt                          251 (1.77)   92 (0.84)   92 (0.84)
-f64 torchfilt, covariance too          287 (2.02)  118 (1.07)  112 (1.03)
-f64 bare torch, in place               142 (1.00)  110 (1.00)  109 (1.00)
-f64 bare torch, naive                  224 (1.58)  176 (1.60)  183 (1.68)
-f64 filterpy resampler + NumPy         297 (2.09)  282 (2.56)  273 (2.50)
-f64 particles                          215 (1.51)  132 (1.20)  147 (1.34)
+f32 bare torch, naive                  145 (2.46)  100 (3.84)  101 (4.29)
+f64 torchfilt, fast normals            199 (2.71)   55 (1.33)   56 (1.25)
+f64 bare torch, in place, f32 normals   74 (1.00)   41 (1.00)   45 (1.00)
+f64 torchfilt                          265 (1.85)   87 (0.78)   88 (0.78)
+f64 torchfilt, covariance too          306 (2.14)  102 (0.92)   99 (0.87)
+f64 bare torch, in place               143 (1.00)  111 (1.00)  114 (1.00)
+f64 bare torch, naive                  222 (1.55)  179 (1.62)  192 (1.69)
+f64 filterpy resampler + NumPy         295 (2.06)  272 (2.46)  274 (2.42)
+f64 particles                          206 (1.44)  131 (1.19)  147 (1.29)
 
 ATen calls a step: torchfilt 59 (19 of them views), bare in place 33 (7).
 
@@ -35,14 +35,14 @@ ns a series and step (ratio to torchfilt with a covariance a row):
 
                                             1 series       100 series    10,000 series
 -----------------------------------  ---------------  ---------------  ---------------
-torchfilt                            130,881 (0.867)    1,385 (0.442)       41 (0.025)
-torchfilt, covariance too            132,484 (0.878)    1,396 (0.445)       39 (0.024)
-torchfilt f32                        131,487 (0.871)    1,382 (0.441)       27 (0.017)
-torchfilt, a covariance a row        150,950 (1.000)    3,137 (1.000)    1,629 (1.000)
-torch, the obvious batch              55,627 (0.369)    1,754 (0.559)    1,169 (0.717)
-torch-kf*                             48,823 (0.323)    1,344 (0.429)      873 (0.536)
-filterpy                              58,081 (0.385)  55,832 (17.801)  55,819 (34.264)
-torchfilt, a tenth missing anywhere  154,439 (1.023)    4,100 (1.307)    1,899 (1.166)
+torchfilt                            139,496 (0.864)    1,457 (0.452)       42 (0.025)
+torchfilt, covariance too            141,289 (0.875)    1,482 (0.460)       43 (0.026)
+torchfilt f32                        141,539 (0.877)    1,483 (0.460)       30 (0.018)
+torchfilt, a covariance a row        161,462 (1.000)    3,224 (1.000)    1,664 (1.000)
+torch, the obvious batch              56,036 (0.347)    1,727 (0.536)    1,182 (0.710)
+torch-kf*                             48,398 (0.300)    1,326 (0.411)      866 (0.520)
+filterpy                              59,276 (0.367)  56,528 (17.532)  58,721 (35.290)
+torchfilt, a tenth missing anywhere  165,412 (1.024)    4,119 (1.278)    1,987 (1.194)
 
 * no log-likelihood. filterpy ran over at most 3 series, scaled.
 
@@ -51,18 +51,18 @@ ns a series and step (ratio to filterpy, which ran over at most 3 series, scaled
 
                       1 series       100 series    10,000 series
 -------------  ---------------  ---------------  ---------------
-filterpy       330,683 (1.000)  338,905 (1.000)  350,169 (1.000)
-torchfilt      484,329 (1.465)    7,858 (0.023)    2,712 (0.008)
-torchfilt f32  460,091 (1.391)    7,138 (0.021)    2,136 (0.006)
+filterpy       360,185 (1.000)  350,805 (1.000)  351,353 (1.000)
+torchfilt      556,801 (1.546)    8,336 (0.024)    2,684 (0.008)
+torchfilt f32  528,129 (1.466)    7,473 (0.021)    2,092 (0.006)
 
 Unscented particle filter, 6 states, one series: ns a particle and step.
 
                   ns
 -------------  -----
-f64, n = 200   7,462
-f32, n = 200   7,007
-f64, n = 1000  4,997
-f32, n = 1000  4,580
+f64, n = 200   7,523
+f32, n = 200   7,236
+f64, n = 1000  5,386
+f32, n = 1000  4,714
 -- end of the last result --
 """
 
